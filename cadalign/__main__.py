@@ -1,8 +1,8 @@
-"""`python -m cadalign`: the command line, where the command itself is not on the path."""
+"""`python -m cadalign`: the command line, also without the command on the path."""
 
 import sys
 
 from cadalign.cli import main
 
-if __name__ == "__main__":  # also loaded, without running it, by processes that this one starts
+if __name__ == "__main__":  # child processes import this module without running it
     sys.exit(main())

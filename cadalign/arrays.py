@@ -1,4 +1,4 @@
-"""Array types, checks of arguments, and random streams of instances."""
+"""Array types, argument checks and random generators of instances."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-_LEAST, _MOST = 1e-100, 1e100  # squares of what lies between do not overflow
+_LEAST, _MOST = 1e-100, 1e100  # squares of values in this range do not overflow
 _NUMBERS = (float, int, np.integer, np.floating)
 
 
@@ -40,17 +40,17 @@ def as_floats(
     Returns
     -------
     (*shape) float
-        A C-contiguous array; the input itself where it already is one.
+        A C-contiguous array; the input itself if it already is one.
 
     Raises
     ------
     InputError
-        If it is not numeric, has another shape, or holds NaN or infinite values.
+        If the value is not numeric, has another shape, or holds NaN or infinite values.
     """
     if type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous:
         array: FloatArray = value
     else:
-        array = _converted(value, name)
+        array = _to_floats(value, name)
     if array.ndim != len(shape) or any(
         wanted is not None and wanted != actual
         for wanted, actual in zip(shape, array.shape, strict=True)
@@ -62,7 +62,7 @@ def as_floats(
     return array
 
 
-def _converted(value: Any, name: str) -> FloatArray:
+def _to_floats(value: Any, name: str) -> FloatArray:
     try:
         found = np.asarray(value)
         if found.dtype.kind in "cmM":  # complex numbers and times
@@ -81,44 +81,44 @@ def _converted(value: Any, name: str) -> FloatArray:
 
 
 def is_masked(value: object) -> bool:
-    """True if some elements of an array are masked; asks without importing ``numpy.ma``."""
+    """True if any element of an array is masked; does not import ``numpy.ma``."""
     return isinstance(value, np.ndarray) and bool(np.any(getattr(value, "mask", False)))
 
 
 def is_real(value: Any) -> bool:
-    """True for a real number, of NumPy or not, finite or not."""
+    """True for a real Python or NumPy number, finite or not."""
     return isinstance(value, _NUMBERS) and not isinstance(value, bool | np.timedelta64)
 
 
 def is_number(value: Any) -> bool:
-    """True for a finite real number, of NumPy or not."""
+    """True for a finite real Python or NumPy number."""
     if not is_real(value):
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number beyond all floats
+    except OverflowError:  # an int too large for a float
         return False
 
 
 def is_whole(value: Any) -> bool:
-    """True for an integer, of NumPy or not."""
+    """True for a Python or NumPy integer."""
     return is_number(value) and isinstance(value, int | np.integer)
 
 
 def require_counts(**given: Any) -> None:
-    """Raise an InputError for a named value that is no whole number from 1."""
+    """Raise an InputError if any keyword argument is not a whole number >= 1."""
     for name, value in given.items():
         if not is_whole(value) or value < 1:
             raise InputError(f"{value!r} is not a whole number >= 1", where=name)
 
 
 def as_positive(value: Any, *, name: str) -> float:
-    """Convert a positive number of any type to a float: kernels take no other.
+    """Convert a positive number of any type to a float, for kernels.
 
     Raises
     ------
     InputError
-        If it is not a positive number, or its square is out of range.
+        If the value is not a positive number, or its square is out of range.
     """
     if not is_number(value) or not value > 0:
         raise InputError(f"{quote(value)} is not positive and finite", where=name)
@@ -144,12 +144,12 @@ def describe_non_finite(array: FloatArray) -> str:
 
 
 def worker_count(workers: Any) -> int:
-    """Number of workers that an argument ``workers`` asks for: all cores where it is -1.
+    """Convert an argument ``workers`` to a number of workers; -1 means all cores.
 
     Raises
     ------
     InputError
-        If it is no whole number, or neither positive nor -1.
+        If ``workers`` is not a whole number, or neither positive nor -1.
     """
     if not isinstance(workers, int | np.integer) or (workers < 1 and workers != -1):
         what = f"must be >= 1, or -1 for all cores, not {quote(workers)}"
@@ -158,7 +158,7 @@ def worker_count(workers: Any) -> int:
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return an array of the same values that cannot be written to, for frozen types."""
+    """Copy an array to a read-only one, unless it is read-only already."""
     if array.flags.writeable:
         array = array.copy()
         array.flags.writeable = False
@@ -168,14 +168,14 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def parse_numbers(
     text: bytes, count: int, dtype: type[np.generic] = np.float64
 ) -> npt.NDArray[Any]:
-    """Read numbers between white space, (count,); raises ValueError if the text is anything else.
+    """Read numbers separated by white space, (count,); raises ValueError on any other text.
 
-    At "0.1.2" older NumPy stops with a mere warning, after 0.1: the number that follows the text
-    tells whether all of it was read.
+    At "0.1.2" older NumPy stops after 0.1 with only a warning. The number appended to the text
+    shows whether all of the text was read.
     """
     try:
         values = np.fromstring(text + b" 0", sep=" ", dtype=dtype)
-    except Warning as error:  # of older NumPy, where warnings are errors
+    except Warning as error:  # older NumPy, if warnings are errors
         raise ValueError(str(error)) from None
     if len(values) != count + 1:
         raise ValueError("not all of it is numbers")
@@ -183,11 +183,12 @@ def parse_numbers(
 
 
 def as_one_or_each(value: Any, *, name: str, count: int, entries: str) -> FloatArray:
-    """One positive number, or (count,) of them, one for each of the ``entries``.
+    """Convert one positive number, or (count,) of them, to an array.
 
-    Raises InputError if it has another shape, or a value is not positive and finite.
+    ``entries`` names what the numbers belong to, for the message. Raises InputError if the shape is
+    wrong, or a value is not positive and finite.
     """
-    array = _converted(value, name)
+    array = _to_floats(value, name)
     if array.shape not in ((), (count,)):
         fix = f"give one, or one for each of {count} {entries}"
         raise InputError(f"{array.size} numbers", where=name, fix=fix)
@@ -197,7 +198,7 @@ def as_one_or_each(value: Any, *, name: str, count: int, entries: str) -> FloatA
 
 
 def copied(value: Any) -> Any:
-    """A copy of an argument, an array or what makes one: the caller may go on to change it."""
+    """Copy an array-like argument, which the caller may change later."""
     try:
         return deepcopy(value)
     except TypeError:  # a memoryview
@@ -205,9 +206,9 @@ def copied(value: Any) -> Any:
 
 
 def instance_rng(seed: int, *names: str) -> np.random.Generator:
-    """Derive the random generator of one instance of a dataset.
+    """Make the random generator of one instance of a dataset.
 
-    Results then depend neither on the order of instances nor on the number of workers.
+    Results then do not depend on the order of instances or the number of workers.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The errors of cadalign: one family, each saying what is wrong, where, and what to do."""
+"""Exceptions of cadalign; messages say what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from functools import partial
 from typing import Any
 
 _QUOTED_LENGTH = 200
-_NEAR = 0.7  # similarity of names from which one may be meant by the other
+_NEAR = 0.7  # similarity of names above which one is suggested for the other
 
 
 class CadalignError(Exception):
-    """Base class of every error that cadalign raises on purpose.
+    """Base class of cadalign's exceptions.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class CadalignError(Exception):
         return text if self.fix is None else f"{text}; {self.fix}"
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Worker processes pickle errors, and keyword-only arguments don't survive that by default.
+        # Worker processes pickle errors; by default that loses keyword-only arguments.
         return partial(type(self), where=self.where, fix=self.fix), (self.what,)
 
 
@@ -58,19 +58,19 @@ class NoConsensusError(CadalignError):
 
 
 class DataError(CadalignError):
-    """A file is missing, malformed or contradicts itself."""
+    """A file is missing, malformed or inconsistent."""
 
 
 class RenderError(CadalignError):
-    """Something cannot be drawn: an empty mesh, an image size out of bounds, no view found."""
+    """Rendering failed: an empty mesh, an image size out of range, or no suitable view."""
 
 
 class TooFewVisibleError(DegenerateError, RenderError):
-    """No view of an object shows as many keypoints as are asked for."""
+    """No view of an object shows the required number of keypoints."""
 
 
 def require_kind(value: object, kind: type, where: str, *, fix: str | None = None) -> None:
-    """Refuse a value that is not of one of cadalign's classes."""
+    """Raise an InputError if a value is not an instance of a class of cadalign."""
     if not isinstance(value, kind):
         what = f"expected a cadalign.{kind.__name__}, got {type(value).__name__}"
         raise InputError(what, where=where, fix=fix)
@@ -79,7 +79,7 @@ def require_kind(value: object, kind: type, where: str, *, fix: str | None = Non
 def unknown(
     kind: str, value: object, known: Iterable[str], *, where: str | None = None
 ) -> InputError:
-    """The error of a value that is none of the known ones, of which it names the nearest.
+    """Make the error for an unknown value; it suggests the most similar known value.
 
     Examples
     --------
@@ -110,13 +110,13 @@ def quote(value: Any) -> str:
     short.maxlist = short.maxtuple = short.maxdict = 12
     try:
         text = short.repr(value)
-    except ValueError:  # a whole number of thousands of digits
+    except ValueError:  # an int with too many digits to print
         text = f"a {type(value).__name__} of thousands of digits"
     return _cut(text)
 
 
 def brief(text: object) -> str:
-    """A text that a file holds, or another library's message, in at most 200 printable characters.
+    """Cut text from a file or another library to at most 200 printable characters.
 
     Examples
     --------
@@ -133,7 +133,7 @@ def _cut(text: str) -> str:
 def refuse_unused(
     options: Any, names: Iterable[str], why: str, *, fix: str = "leave it out"
 ) -> None:
-    """Refuse fields of options that are given, not at their defaults, though not used."""
+    """Raise an InputError if a field in ``names`` is set though it has no effect."""
     for each in fields(options):
         default = each.default if each.default_factory is MISSING else each.default_factory()
         if each.name in names and getattr(options, each.name) != default:

@@ -1,9 +1,8 @@
 """Errors between an estimate and the truth.
 
-Metrics take the estimate and the truth, score a perfect estimate as perfect, and refuse NaN. Errors
-of alignments accept the model's ``symmetry`` and then use the truth of `nearest_truth`. Functions
-with plural names are the formulas for stacks of arrays with leading dimensions (...). They check
-nothing, and give each member the same error, bit for bit.
+Metrics of alignments accept the model's ``symmetry`` and then compare with `nearest_truth`.
+Functions with plural names compute the same errors, bit for bit, for stacked arrays (...), without
+checks.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ __all__ = [
     "translation_error_up_to_scale",
 ]
 
-_SAME_STRETCH = 0.01  # relative difference of true scales that annotations do not tell from 0
-_LEAST_SIDE = 1e-9  # of the longest side of a box with a volume
+_SAME_STRETCH = 0.01  # relative difference of true scales within the accuracy of annotations
+_LEAST_SIDE = 1e-9  # shortest side of a box with a volume, over the longest
 
 
 class Alignments(NamedTuple):
-    """Alignments of n models: their rotations (n, 3, 3), translations (n, 3) and scales (n, 3)."""
+    """Alignments of n models: rotations (n, 3, 3), translations (n, 3) and scales (n, 3)."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -42,14 +41,14 @@ class Alignments(NamedTuple):
 
     @classmethod
     def of(cls, alignments: Sequence[Alignment]) -> Alignments:
-        """Stack single alignments, at least one."""
+        """Stack one or more alignments."""
         return cls(
             *(np.array([getattr(each, name) for each in alignments]) for name in cls._fields)
         )
 
 
 class Boxes(NamedTuple):
-    """Boxes of n models: their centres (n, 3), axes (n, 3, 3) and side lengths (n, 3)."""
+    """Boxes of n models: centres (n, 3), axes (n, 3, 3) and side lengths (n, 3)."""
 
     center: FloatArray
     rotation: FloatArray
@@ -57,7 +56,7 @@ class Boxes(NamedTuple):
 
     @classmethod
     def from_models(cls, bounds: FloatArray, alignments: Alignments) -> Boxes:
-        """The boxes of models with the bounds (n, 2, 3); see `Box.from_model`."""
+        """Make boxes from models' bounds (n, 2, 3); see `Box.from_model`."""
         return cls(*oriented_box(bounds, *alignments))
 
 
@@ -66,11 +65,10 @@ _Boxes = Box | Boxes
 
 
 def nearest_truth(est: Alignment, gt: Alignment, *, symmetry: Symmetry) -> Alignment:
-    """The truth whose rotation is nearest to the estimate's, among those that are equal.
+    """Find the equivalent true alignment whose rotation is nearest to the estimate's.
 
-    The model's symmetries take it to itself, so that several alignments place the same object; see
-    `cadalign.geometry.symmetry` for what a stretch leaves of them. True scales that differ
-    by up to 1 % count as equal.
+    Alignments that differ by a symmetry of the model place the same object; see
+    `cadalign.geometry.symmetry`. True scales that differ by up to 1 % count as equal.
 
     Examples
     --------
@@ -90,7 +88,7 @@ def _truth(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> Alignmen
 
 
 def rotation_error(est: Alignment, gt: Alignment, *, symmetry: Symmetry | None = None) -> float:
-    """Angle of the rotation between estimate and truth [degrees], 0 to 180.
+    """Angle between the rotations of estimate and truth [degrees], 0 to 180.
 
     Examples
     --------
@@ -110,10 +108,9 @@ def translation_error_up_to_scale(
 ) -> float:
     """Distance of the true translation from the ray through the estimated one [model units].
 
-    One image leaves open if a large object is far away or a small one nearby: the estimate may be
-    scaled about the camera centre by any factor from 0 up. This is the error that remains for the
-    best factor, the norm of the true translation times the sine of the angle between the two; all
-    of the norm beyond 90 degrees.
+    One image determines size and distance only up to a common factor >= 0. This is the translation
+    error for the best factor: the norm of the true translation times the sine of the angle between
+    the two, or the whole norm beyond 90 degrees.
 
     Examples
     --------
@@ -137,10 +134,10 @@ def scale_error(est: Alignment, gt: Alignment, *, symmetry: Symmetry | None = No
 
 
 def box_iou(est: Box, gt: Box) -> float:
-    """Volume of the intersection of two oriented boxes over that of their union, 0 to 1.
+    """Intersection over union of the volumes of two oriented boxes, 0 to 1.
 
-    Exact to rounding; see `cadalign.geometry.clipping.intersection_volume`. Raises InputError if a
-    box has no volume: the ratio means nothing then.
+    Exact up to rounding; see `cadalign.geometry.clipping.intersection_volume`. Raises InputError if
+    a box has no volume.
 
     Examples
     --------
@@ -153,17 +150,17 @@ def box_iou(est: Box, gt: Box) -> float:
 
 
 def box_iou_up_to_scale(est: Box, gt: Box) -> float:
-    """Largest box IoU over all factors by which the estimate is scaled about the origin, 0 to 1.
+    """Largest box IoU over all scalings of the estimate about the camera centre, 0 to 1.
 
-    The origin is the camera centre, from which one image does not determine an object's distance.
-    Unlike the IoU at equal distances of the two centres, this one does not change if estimate and
-    truth are exchanged, and a wrong length along the line of sight costs no more than it must.
+    One image determines size and distance only up to a common factor. Unlike the IoU at equal
+    distances of the centres, this metric is symmetric in estimate and truth, and a wrong length
+    along the line of sight costs no more than it must.
 
-    Global, to 1e-6. Where the boxes s E and G intersect, the cube root of the intersection's volume
-    is a concave function of s (Brunn-Minkowski; the pairs of s and a point of s E form a convex
-    cone), and that of the sum of their volumes is convex. The IoU increases with the ratio of the
-    two, which therefore has no local maximum but the global one: a bounded scalar search finds it.
-    A linear program gives the range of s. Raises InputError as `box_iou` does.
+    The maximum is global, to 1e-6. For boxes s E and G that intersect, the cube root of the
+    intersection's volume is concave in s (Brunn-Minkowski; the pairs of s and a point of s E form a
+    convex cone), and the cube root of the sum of the volumes is convex. The IoU increases with the
+    ratio of the two, which has no local maximum but the global one. A linear program gives the
+    range of s, a bounded scalar search the maximum. Raises InputError as `box_iou` does.
 
     Examples
     --------
@@ -184,7 +181,7 @@ def box_iou_up_to_scale(est: Box, gt: Box) -> float:
         factor = np.exp(logarithm)
         return -box_iou(est=Box(factor * est.center, est.rotation, factor * est.extents), gt=gt)
 
-    # A perfect estimate has its maximum in a kink, which the search only comes close to.
+    # The maximum of a perfect estimate is a kink, which the search only approximates.
     likely = [np.cbrt(gt.volume / est.volume)]
     if est.center.any() and gt.center.any():
         likely.append(np.linalg.norm(gt.center) / np.linalg.norm(est.center))
@@ -202,9 +199,9 @@ def _check_volumes(est: Box, gt: Box) -> None:
 
 
 def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
-    """Range of the factors at which the scaled estimate meets the truth; None if there are none.
+    """Range of the factors at which the scaled estimate intersects the truth; None if empty.
 
-    Factors at which one volume is over 1e9 times the other are left out.
+    Factors that make one volume more than 1e9 times the other are ignored.
     """
     from scipy.optimize import linprog
 
@@ -255,16 +252,16 @@ def scale_errors(*, est: _Poses, gt: _Poses) -> FloatArray:
 
 
 def have_volume(boxes: _Boxes) -> BoolArray:
-    """Mask (...) of the boxes that are not flat."""
+    """Mask (...) of the boxes with a volume."""
     extents = boxes.extents
     return np.asarray(extents.min(axis=-1) > _LEAST_SIDE * extents.max(axis=-1))
 
 
 def box_ious(*, est: _Boxes, gt: _Boxes) -> FloatArray:
-    """Intersections over unions (...) of boxes that have a volume; see `box_iou`."""
-    from cadalign.geometry.clipping import intersection_volume  # `import cadalign` compiles nothing
+    """Intersections over unions (...) of boxes with a volume; see `box_iou`."""
+    from cadalign.geometry.clipping import intersection_volume  # compiles; not on import
 
-    # In a unit of about the boxes' own size no square under- or overflows.
+    # Relative to the boxes' size, no product under- or overflows.
     unit = np.maximum(est.extents.max(axis=-1), gt.extents.max(axis=-1))
     to_est = est.rotation.swapaxes(-1, -2)
     centers = (to_est @ (gt.center - est.center)[..., None])[..., 0] / unit[..., None]
@@ -273,7 +270,7 @@ def box_ious(*, est: _Boxes, gt: _Boxes) -> FloatArray:
     vectors = (each.reshape(-1, 3) for each in (sides, gt_sides, centers))
     pairs = ((a, b, turn, c) for a, b, c, turn in zip(*vectors, turns, strict=True))
     shared = np.reshape([intersection_volume(*pair) for pair in pairs], unit.shape)
-    # Python's powers: NumPy rounds those of an array otherwise than that of a number.
+    # Python's power, since NumPy rounds powers of arrays and of numbers differently.
     cubes = np.reshape([side**3 for side in unit.ravel().tolist()], unit.shape)
     total = (est.extents.prod(axis=-1) + gt.extents.prod(axis=-1)) / cubes
     return np.asarray(np.clip(shared / (total - shared), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Public names: imported when they are first asked for (PEP 562)."""
+"""Lazy import of public names (PEP 562)."""
 
 from __future__ import annotations
 
@@ -10,19 +10,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-# An import in the block `if TYPE_CHECKING:` at the top of a package, as the formatter writes it.
+# An import in a package's block `if TYPE_CHECKING:`, in the formatter's style.
 _IMPORT = re.compile(r"^    from (cadalign[\w.]*) import (?:\(([^)]*)\)|(.*))", re.M)
 _NAME = re.compile(r"(\w+)(?: as (\w+))?")
 
 
 def lazy_names(package: str) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a package: imports what its block ``if TYPE_CHECKING`` imports.
+    """Make the ``__getattr__`` of a package, which imports names and modules on first access.
 
-    The package's ``dir`` lists its ``__all__``.
-
-    That block is the only list: type checkers and editors read it as it stands. A name is imported
-    when it is first asked for, and so are the package's modules, so that a program does not wait
-    for what it does not use.
+    The names are those imported in the package's block ``if TYPE_CHECKING``, which type checkers
+    and editors read, too. The package's ``dir`` lists its ``__all__``.
 
     Parameters
     ----------

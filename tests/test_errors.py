@@ -1,4 +1,4 @@
-"""The errors: one family, one way to put them in words, and safe passage between processes."""
+"""Exceptions: common base class, message format and pickling."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_pickles_and_copies_keep_kind_and_text(kind: type[CadalignError], duplic
     assert (again.what, again.where, again.fix) == (error.what, error.where, error.fix)
 
 
-def test_kinds_are_one_family_and_wrong_arguments_are_value_errors_too() -> None:
+def test_all_errors_share_a_base_and_input_errors_are_value_errors() -> None:
     assert all(issubclass(kind, CadalignError) for kind in KINDS)
     assert issubclass(InputError, ValueError)
     assert not issubclass(DegenerateError, ValueError)

@@ -1,4 +1,4 @@
-"""Cameras, alignments, boxes and meshes, and their conventions."""
+"""Cameras, alignments, boxes and meshes."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Alignment of a CAD model, the box it leads to, its deviations, and when these are large."""
+"""Alignments of CAD models, their boxes and their uncertainties."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ UNCERTAIN = 0.25
 """Relative standard deviation beyond which a stretch, a distance or a focal length is uncertain."""
 UNCERTAIN_ROTATION_DEG = 30.0
 NOT_DETERMINED = 1.0
-"""Relative standard deviation beyond which a number makes no sense."""
+"""Relative standard deviation beyond which a number is meaningless."""
 NOT_DETERMINED_ROTATION_DEG = 60.0
-_THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
+_THIN = 0.1  # spread of nearly coplanar points across their plane, over the largest spread
 _END_ON = math.cos(math.radians(15.0))
 _ROUNDING = 1e-12  # relative standard deviation below which a length is known
 
 OPENGL_AXES = np.array([1.0, -1.0, -1.0])
-"""Signs of OpenGL's camera axes (x right, y up, z backward; also those of NeRF, ARKit and ARCore)
-in cadalign's: multiply coordinates (n, 3) to go either way. The only place for them."""
+"""Signs (3,) that convert points (n, 3) between OpenGL's camera axes (x right, y up, z backward;
+also NeRF, ARKit and ARCore) and cadalign's, in either direction."""
 OPENGL_FLIP = np.diag([*OPENGL_AXES, 1.0])
-"""Motion (4, 4) between the axes of the two cameras, either way."""
+"""Homogeneous transform (4, 4) between the two camera frames, in either direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,25 +38,25 @@ class Alignment:
     """Pose and stretch of a model.
 
     ``x_cam = rotation @ diag(scale) @ x + translation``: the stretch acts along the model's own
-    axes, before the rotation. Estimated alignments have ``scale[0] == 1``: one image alone does not
-    tell a large object far away from a small one nearby, so the model's length along x is taken as
+    axes, before the rotation. Estimated alignments have ``scale[0] == 1``: one image alone cannot
+    tell a large distant object from a small near one, so the model's length along x is assumed
     known.
 
     Parameters
     ----------
     rotation : (3, 3) float
-        Orthonormal to 1e-2, with determinant +1; the nearest rotation is taken.
+        Orthonormal to 1e-2, with determinant +1. The nearest rotation is used.
     translation : (3,) float
         The model's origin in the camera frame [model units].
     scale : (3,) float
         Stretch along the model's x, y and z, positive.
     is_valid : bool
-        The arrays are known to be valid: take them over unchecked, and make them read-only.
+        Skip the checks and make the given arrays read-only. For arrays known to be valid.
 
     Raises
     ------
     InputError
-        If a shape or value is wrong, the rotation is not one, or a scale is not positive.
+        If a shape or value is wrong, ``rotation`` is not a rotation, or a scale is not positive.
 
     Examples
     --------
@@ -87,18 +87,18 @@ class Alignment:
 
     @classmethod
     def from_packed(cls, pose: FloatArray) -> Alignment:
-        """Copy a solver's packed pose (15,): rotation row by row, translation, scale."""
+        """Make an alignment from a packed pose (15,): rotation row by row, translation, scale."""
         pose = pose.copy()
         return cls(pose[:9].reshape(3, 3), pose[9:12], pose[12:], is_valid=True)
 
     @property
     def packed(self) -> FloatArray:
-        """The pose as `from_packed` reads it, (15,) float."""
+        """Packed pose, (15,) float; see `from_packed`."""
         return np.concatenate([self.rotation.ravel(), self.translation, self.scale])
 
     @classmethod
     def identity(cls) -> Alignment:
-        """The alignment that leaves every point where it is."""
+        """Make the identity alignment."""
         return cls(np.eye(3), np.zeros(3), np.ones(3))
 
     def __eq__(self, other: object) -> bool:
@@ -116,18 +116,18 @@ class Alignment:
 
     @property
     def cam_from_model(self) -> FloatArray:
-        """The homogeneous transform from stretched-model to camera coordinates, (4, 4) float."""
+        """Homogeneous transform from model to camera coordinates, stretch included, (4, 4)."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.linear
         matrix[:3, 3] = self.translation
         return matrix
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
-        """Take model points (n, 3) into the camera frame; (n, 3) float."""
+        """Transform model points (n, 3) to the camera frame; (n, 3) float."""
         return as_points(points, name="points", dimension=3) @ self.linear.T + self.translation
 
     def inverse(self, points_cam: npt.ArrayLike) -> FloatArray:
-        """Take camera-frame points (n, 3) back to the model's coordinates; (n, 3) float.
+        """Transform camera-frame points (n, 3) to model coordinates; (n, 3) float.
 
         Examples
         --------
@@ -139,12 +139,12 @@ class Alignment:
         return (points - self.translation) @ self.rotation / self.scale
 
     def to_dict(self) -> dict[str, list[Any]]:
-        """Write the alignment as plain lists, for JSON."""
+        """Convert to a dict of lists, for JSON."""
         return {name: getattr(self, name).tolist() for name in _FIELDS}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Alignment:
-        """Read what `to_dict` wrote; raises InputError if a field is missing or invalid."""
+        """Read the form of `to_dict`; raises InputError if a field is missing or invalid."""
         if not isinstance(data, Mapping):
             raise InputError(f"expected an object, got {type(data).__name__}")
         for name in _FIELDS:
@@ -156,13 +156,13 @@ class Alignment:
 def model_rays(cam_from_model: Alignment) -> tuple[FloatArray, FloatArray]:
     """Camera rays in the model's frame: their origin (3,), and a matrix (3, 3) for directions.
 
-    The matrix takes (u, v, 1) to the direction whose parameter is the depth in the camera.
+    The matrix maps (u, v, 1) to a direction; the ray's point at depth z is origin + z direction.
     """
     model_from_ray = cam_from_model.rotation.T / cam_from_model.scale[:, None]
     return -model_from_ray @ cam_from_model.translation, model_from_ray
 
 
-# Corner i lies at the high side of axis k where bit k of i is set.
+# Corner i lies at the high side of axis k if bit k of i is set.
 _CORNER_SIGNS = np.array([[1 if i >> k & 1 else -1 for k in range(3)] for i in range(8)]) / 2
 BOX_EDGES = tuple((i, i | 1 << k) for k in range(3) for i in range(8) if not i >> k & 1)
 """The 12 edges as pairs of corner numbers: four along x, four along y, four along z."""
@@ -174,13 +174,13 @@ def extent(points: FloatArray) -> FloatArray:
 
 
 def are_on_a_line(points: FloatArray, flat: float) -> bool:
-    """True for points (n, 3) whose second extent is at most ``flat`` times the first."""
+    """True if points (n, 3) have a second principal extent of at most ``flat`` times the first."""
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(extents[1] <= flat * extents[0])
 
 
 def describe_plane(points_3d: FloatArray) -> str | None:
-    """Describe how the points fail to span a volume; None if they span one."""
+    """Describe how points (n, 3) are degenerate; None if they span a volume."""
     mean = points_3d.mean(axis=0)
     rows = np.vstack([points_3d - mean, np.zeros((3, 3))])  # at least three
     if not np.isfinite(rows).all():
@@ -199,7 +199,7 @@ def describe_plane(points_3d: FloatArray) -> str | None:
 
 
 def bounds_corners(low: FloatArray, high: FloatArray) -> FloatArray:
-    """The 8 corners (8, 3) between lowest and highest coordinates, in the order of a `Box`."""
+    """Corners (8, 3) of the axis-aligned box between two points (3,), in the order of a `Box`."""
     return np.where(_CORNER_SIGNS > 0, high, low)
 
 
@@ -214,11 +214,11 @@ class Box:
     """
 
     center: FloatArray
-    """The box's centre (3,)."""
+    """Centre (3,)."""
     rotation: FloatArray
-    """Its axes are the columns (3, 3)."""
+    """Axes of the box as columns (3, 3)."""
     extents: FloatArray
-    """Its full side lengths along these axes (3,), not negative."""
+    """Full side lengths along these axes (3,), not negative."""
 
     def __post_init__(self) -> None:
         center = as_floats(self.center, name="center", shape=(3,))
@@ -231,9 +231,9 @@ class Box:
 
     @classmethod
     def from_model(cls, bounds: npt.ArrayLike, alignment: Alignment) -> Box:
-        """Make the box, in the camera frame, of a model that is stretched and placed.
+        """Make the box of an aligned model, in the camera frame.
 
-        ``bounds`` (2, 3) are the lowest and highest coordinates of the model in its own frame.
+        ``bounds`` (2, 3) are the model's least and greatest coordinates in its own frame.
 
         Examples
         --------
@@ -248,12 +248,12 @@ class Box:
 
     @property
     def corners(self) -> FloatArray:
-        """The 8 corners, (8, 3) float; `BOX_EDGES` says which of them an edge joins."""
+        """The 8 corners, (8, 3) float; `BOX_EDGES` lists the pairs that an edge joins."""
         return self.center + (_CORNER_SIGNS * self.extents) @ self.rotation.T
 
     @property
     def volume(self) -> float:
-        """The volume [model units cubed]."""
+        """Volume [model units cubed]."""
         width, height, length = self.extents.tolist()
         return float(width * height * length)
 
@@ -261,9 +261,9 @@ class Box:
 def oriented_box(
     bounds: FloatArray, rotation: FloatArray, translation: FloatArray, scale: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Centre, axes and side lengths of a placed model's box: the arrays of a `Box`.
+    """Centre (..., 3), axes (..., 3, 3) and side lengths (..., 3) of aligned models' boxes.
 
-    Also of stacked models: ``bounds`` (..., 2, 3), ``rotation`` (..., 3, 3), ``translation`` and
+    Parameters are stacked: ``bounds`` (..., 2, 3), ``rotation`` (..., 3, 3), ``translation`` and
     ``scale`` (..., 3).
     """
     low, high = bounds[..., 0, :], bounds[..., 1, :]
@@ -277,13 +277,13 @@ class Uncertainty:
     """Predicted standard deviations of an alignment."""
 
     rotation_deg: float
-    """Rotation [degrees]: the root of the sum of the variances about three axes."""
+    """Rotation [degrees]: square root of the sum of the variances about three axes."""
     translation: tuple[float, float, float]
-    """Along the camera's axes [model units]."""
+    """Translation along the camera's axes [model units]."""
     scale: tuple[float, float, float]
-    """Scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known."""
+    """Scale along the model's x, y, z, relative (0.02 is 2 %); 0 if it is known."""
     focal: float
-    """Focal length, relative; 0 where it is known."""
+    """Focal length, relative; 0 if it is known."""
 
 
 def uncertainty_of(covariance: FloatArray) -> Uncertainty:
@@ -300,7 +300,7 @@ def uncertainty_of(covariance: FloatArray) -> Uncertainty:
 
 
 def distance_deviation(alignment: Alignment, covariance: FloatArray) -> float:
-    """Standard deviation of the distance from the camera to the model's origin, relative to it."""
+    """Relative standard deviation of the distance from the camera to the model's origin."""
     translation = alignment.translation
     square = float(translation @ translation)
     if not square > 0:
@@ -310,7 +310,9 @@ def distance_deviation(alignment: Alignment, covariance: FloatArray) -> float:
 
 
 def uncertain_of(alignment: Alignment, covariance: FloatArray) -> tuple[str, ...]:
-    """Names of what is uncertain: "s_x", "s_y", "s_z", "distance", "focal length", "rotation".
+    """Names of the uncertain quantities.
+
+    These are "s_x", "s_y", "s_z", "distance", "focal length" and "rotation".
 
     Examples
     --------
@@ -326,7 +328,7 @@ def uncertain_of(alignment: Alignment, covariance: FloatArray) -> tuple[str, ...
 
 
 def deviation_text(relative: float) -> str:
-    """A relative standard deviation as it follows a number.
+    """Format a relative standard deviation, to append to a number.
 
     Examples
     --------
@@ -339,7 +341,7 @@ def deviation_text(relative: float) -> str:
 
 
 def why_open(name: str, points_3d: FloatArray, alignment: Alignment) -> str:
-    """The reason for an uncertain stretch of keypoints (n, 3), in brackets; empty for others."""
+    """Explain an uncertain stretch, in brackets, to append to its name; empty if unexplained."""
     axis = {"s_x": 0, "s_y": 1, "s_z": 2}.get(name)
     if axis is None or not len(points_3d):
         return ""

@@ -1,4 +1,4 @@
-"""The numbers of a calibrated camera, checked and questioned, and their form in JSON."""
+"""Parameters of a calibrated camera: validation, plausibility checks and JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cadalign.geometry.pixels import (
     PIXEL_CENTRE,
     LensKind,
     PixelOrigin,
-    checked_coefficients,
+    check_coefficients,
     require_perspective_lens,
     rescaled_pixels,
     shift_of,
@@ -33,28 +33,28 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-_C = TypeVar("_C", bound="Calibration")  # which completion in editors follows, unlike Self
+_C = TypeVar("_C", bound="Calibration")  # editors complete this, but not Self
 _COEFFICIENTS: dict[LensKind, tuple[str, ...]] = {
     "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-_WRITTEN = {0: "PINHOLE", 4: "OPENCV"}  # models, by the number of coefficients
+_MODELS = {0: "PINHOLE", 4: "OPENCV"}  # COLMAP model by number of coefficients
 _NO_SKEW = 1e-9  # relative to the focal length
 _SIZE = ("width", "height")
 _FORMS = {"params": ("model", *_SIZE, "params"), "matrix": ("matrix", *_SIZE)}
 _MATRIX_FIELDS = (*_FORMS["matrix"], "pixel_origin", "distortion", "lens")
 
 OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
-"""Usual sizes of other images of a photo, over that of its camera."""
-_FAR_FROM_MIDDLE = 0.3  # of an image's size, from its middle to a principal point
-_SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
+"""Usual factors by which a photo is resized."""
+_FAR_FROM_MIDDLE = 0.3  # distance of the principal point from the image's middle, over its size
+_SAME_MIDDLE = 0.02  # such a distance at which the principal point counts as the middle
 _OBLONG = 1.1  # ratio of a pixel's sides
 _WIDEST_DEG = 120.0  # angle of view of a camera without a lens model
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Image size, focal lengths, principal point and lens; `cadalign.Camera` describes them."""
+    """Image size, focal lengths, principal point and lens; see `cadalign.Camera`."""
 
     width: int
     height: int
@@ -66,7 +66,7 @@ class Calibration:
     lens: LensKind = field(default="perspective", kw_only=True)
     focal_known: bool = field(default=True, kw_only=True, repr=False)
     turn: tuple[float, ...] = field(default=(), kw_only=True, repr=False)
-    """Rotation by rows from the frame that `turned` gave to the lens's own; empty for none."""
+    """Rotation from a frame of `Camera.turned` to the lens's, by rows; empty if not turned."""
 
     def __post_init__(self) -> None:
         for name in _SIZE:
@@ -83,14 +83,14 @@ class Calibration:
         if not isinstance(known, bool | np.bool_):
             what = f"{quote(known)} is neither True nor False"
             raise InputError(what, where="camera.focal_known")
-        coefficients = checked_coefficients(self.lens, _listed(self.distortion))
+        coefficients = check_coefficients(self.lens, _as_coefficients(self.distortion))
         object.__setattr__(self, "distortion", coefficients)
         if not self.focal_known:
             require_perspective_lens(self.lens, where="camera.lens")
 
     @classmethod
     def from_fov(cls: type[_C], width: int, height: int, *, fov_x: float) -> _C:
-        """Make a camera with square pixels from its horizontal field of view ``fov_x`` [degrees].
+        """Make a camera with square pixels from the horizontal field of view [degrees].
 
         Examples
         --------
@@ -123,14 +123,14 @@ class Calibration:
         matrix : (3, 3) float
             ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` [px], without skew.
         pixel_origin : {"center", "corner"}
-            Where (0, 0) lies for the principal point: at the centre of the top-left pixel (OpenCV,
-            Kalibr, BOP), or at the top-left corner of the image (COLMAP, PyTorch3D, many
-            renderers), half a pixel away.
+            Origin of the principal point's coordinates: the centre of the top-left pixel (OpenCV,
+            Kalibr, BOP), or the top-left corner of the image, half a pixel away (COLMAP,
+            PyTorch3D, many renderers).
 
         Raises
         ------
         InputError
-            If it is no such matrix.
+            If the matrix does not have this form, or a value is invalid.
 
         Examples
         --------
@@ -159,10 +159,10 @@ class Calibration:
         cy: float | None = None,
         distortion: tuple[float, ...] = (),
     ) -> _C:
-        """Make a camera of which only the image is known, for ``fit(..., focal="estimate")``.
+        """Make a camera of unknown focal length, for ``fit(..., focal="estimate")``.
 
-        Its pixels are square. ``fx`` and ``fy`` are placeholders; `project`, `normalize` and fits
-        with a known focal length refuse it. The principal point is the image's centre by default.
+        Pixels are square; the principal point is the image's centre by default. ``fx`` and ``fy``
+        are placeholders: `project`, `normalize` and fits with a known focal length refuse them.
 
         Examples
         --------
@@ -180,16 +180,13 @@ class Calibration:
         return cls(width, height, focal, focal, cx, cy, distortion, focal_known=False)
 
     def with_focal(self: _C, focal: float) -> _C:
-        """The same camera with the horizontal focal length ``focal`` [px], known from now on.
-
-        The shape of its pixels stays: ``fy`` changes in proportion.
-        """
+        """Set the focal length ``fx`` [px], which is then known; ``fy`` changes in proportion."""
         if not is_number(focal):
             raise InputError(f"{quote(focal)} is not a finite number", where="focal")
         return replace(self, fx=focal, fy=focal * (self.fy / self.fx), focal_known=True)
 
     def resized(self: _C, width: int, height: int) -> _C:
-        """The camera of the image after it was resized to so many pixels.
+        """Make the camera of the image resized to ``width`` x ``height`` pixels.
 
         Examples
         --------
@@ -203,9 +200,9 @@ class Calibration:
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def cropped(self: _C, left: int, top: int, width: int, height: int) -> _C:
-        """The camera of a part of the image whose first pixel is (``left``, ``top``).
+        """Make the camera of a crop of the image whose top-left pixel is (``left``, ``top``).
 
-        The part may reach beyond the image, as a crop with a border does.
+        The crop may reach beyond the image.
 
         Examples
         --------
@@ -220,17 +217,17 @@ class Calibration:
 
     @property
     def matrix(self) -> FloatArray:
-        """The calibration matrix K, (3, 3) float, of pixels whose centres are integers."""
+        """Calibration matrix K, (3, 3) float; integer coordinates are pixel centres."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=float)
 
     def require_focal(self) -> None:
-        """Refuse a camera `without_focal` by an InputError."""
+        """Raise an InputError if the focal length is unknown."""
         if not self.focal_known:
             fix = 'estimate it with focal="estimate", or give it: camera.with_focal(...)'
             raise InputError("the focal length is unknown", where="camera", fix=fix)
 
     def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> BoolArray:
-        """Say which pixels (..., 2) lie at least ``margin`` [px] inside the image; (...) bool."""
+        """Mask (...) of the pixels (..., 2) that lie at least ``margin`` [px] inside the image."""
         low = -0.5 + margin
         high = np.array([self.width, self.height]) - 0.5 - margin
         return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=-1))
@@ -238,9 +235,8 @@ class Calibration:
     def to_dict(self) -> dict[str, Any]:
         """Write the camera as COLMAP does: ``{"model", "width", "height", "params"}``.
 
-        COLMAP puts the centre of the top-left pixel at (0.5, 0.5), so the principal point there
-        is larger by half a pixel than ``cx`` and ``cy`` here. An unknown focal length is None,
-        ``null`` in JSON.
+        COLMAP puts the centre of the top-left pixel at (0.5, 0.5), so its principal point is
+        (``cx`` + 0.5, ``cy`` + 0.5). An unknown focal length is None, ``null`` in JSON.
 
         Examples
         --------
@@ -249,9 +245,9 @@ class Calibration:
         [500.0, 500.0, 320.0, 240.0]
         """
         if self.turn:
-            what = "a camera in a turned frame has no form in files"
-            raise InputError(what, where="camera", fix="write the camera that was turned")
-        model = _WRITTEN.get(len(self.distortion), "FULL_OPENCV")
+            what = "a camera with a turned frame cannot be written"
+            raise InputError(what, where="camera", fix="write the camera before it was turned")
+        model = _MODELS.get(len(self.distortion), "FULL_OPENCV")
         model = "OPENCV_FISHEYE" if self.lens == "fisheye" else model
         names = _COEFFICIENTS[self.lens]
         values: dict[str, float | None] = dict(zip(names, self.distortion, strict=False))
@@ -266,18 +262,18 @@ class Calibration:
 
     @classmethod
     def from_dict(cls: type[_C], data: Mapping[str, Any]) -> _C:
-        """Read a camera in COLMAP's form, see `to_dict`, or as a calibration matrix.
+        """Read a camera from COLMAP's form or from a calibration matrix.
 
         Parameters
         ----------
         data : mapping
-            ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV or
-            OPENCV_FISHEYE), ``width``, ``height``, and ``params`` in COLMAP's order and pixel
-            convention. None in the place of the focal
-            lengths, or ``width`` and ``height`` alone, give a camera `without_focal`. Or ``matrix``
-            (3, 3), ``width``, ``height`` and optionally ``distortion`` and ``lens``, as for
-            `from_matrix`. ``pixel_origin`` states where (0, 0) lies: by default ``"corner"`` for
-            ``params`` and ``"center"`` for ``matrix``.
+            COLMAP's form, see `to_dict`: ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
+            OPENCV, FULL_OPENCV or OPENCV_FISHEYE), ``width``, ``height``, and ``params`` in
+            COLMAP's order. With None as focal lengths, or with ``width`` and ``height`` alone, the
+            camera is made by `without_focal`. The other form: ``matrix`` (3, 3), ``width``,
+            ``height`` and optionally ``distortion`` and ``lens``, see `from_matrix`. Both forms
+            accept ``pixel_origin``, by default ``"corner"`` with ``params`` and ``"center"`` with
+            ``matrix``.
 
         Raises
         ------
@@ -313,15 +309,15 @@ class Calibration:
         return make(width=data["width"], height=data["height"], **fields)
 
 
-def _listed(distortion: Any) -> tuple[float, ...]:
-    """Coefficients (n,) of a lens; OpenCV returns them as (1, n), and wants (n, 1) sometimes."""
+def _as_coefficients(distortion: Any) -> tuple[float, ...]:
+    """Convert distortion coefficients to a tuple; OpenCV's have the shapes (1, n) and (n, 1)."""
     try:
         if np.iscomplexobj(distortion) or is_masked(distortion):
             raise TypeError
         if np.ndim(distortion) == 2 and 1 in np.shape(distortion):
             distortion = np.ravel(distortion)
         return tuple(float(value) for value in distortion)
-    except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
+    except (TypeError, ValueError, OverflowError, NotImplementedError):  # the last: memoryview
         raise InputError("not a sequence of numbers", where="camera.distortion") from None
 
 
@@ -333,7 +329,7 @@ def _whole_size(size: Any, name: str) -> int:
 
 
 def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
-    """Read COLMAP's parameters, whose top-left pixel has its centre at ``shift``."""
+    """Read COLMAP's parameters; ``shift`` is the coordinate of the top-left pixel's centre."""
     if not isinstance(model, str) or model not in COLMAP_PARAMS:
         fix = f"known are {', '.join(COLMAP_PARAMS)}; for others undistort the images"
         raise InputError(f"unknown model {quote(model)}", where="camera.model", fix=fix)
@@ -359,12 +355,12 @@ def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
     return fields
 
 
-@lru_cache(maxsize=64)  # most estimates have the camera of others
-@np.errstate(over="ignore")  # sizes of images are any numbers
+@lru_cache(maxsize=64)  # many estimates share a camera
+@np.errstate(over="ignore")  # image sizes are unbounded
 def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str, ...]:
-    """Say what is implausible of a camera, a sentence each; nothing of most.
+    """Sentences about implausible parameters of a camera, usually none.
 
-    A camera ``is_tested`` by keypoints that agree with it: they confirm a short focal length.
+    ``is_tested`` states that keypoints agree with the camera, which confirms a short focal length.
     """
     found, focal = [], np.array([camera.fx, camera.fy])
     own = np.array([camera.width, camera.height], dtype=float)
@@ -375,14 +371,14 @@ def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str,
     if same:
         width, height = sizes[same[0]]
         found.append(
-            f"{point} the middle of an image of {width:.0f} x {height:.0f} px, its own has "
-            f"{size}: if the photo was resized, give Camera.resized({camera.width}, "
-            f"{camera.height}) of its camera"
+            f"{point} the middle of an image of {width:.0f} x {height:.0f} px, but the image "
+            f"has {size}: if the photo was resized, give its original camera.resized("
+            f"{camera.width}, {camera.height})"
         )
     elif np.abs(middle / own - 0.5).max() >= _FAR_FROM_MIDDLE:
         found.append(
-            f"{point} far from the middle of its image of {size}, which is right "
-            "only for a photo cut out of a larger one"
+            f"{point} far from the middle of the image of {size}: this is right only for a "
+            "photo cropped from a larger one"
         )
     if not 1 / _OBLONG < camera.fx / camera.fy < _OBLONG:
         found.append(

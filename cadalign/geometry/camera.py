@@ -1,8 +1,8 @@
-"""The calibrated camera: from camera-frame points to pixels and back; frames that face keypoints.
+"""The calibrated camera: project camera-frame points to pixels and back.
 
-Estimates are made with rays (u, v, 1), which directions beside and behind the camera's plane lack.
-The keypoints of an object that does not surround the camera lie to one side of it: the camera is
-turned about its centre until they lie in front, and what is found is turned back.
+Solvers use rays (u, v, 1). A wide lens also sees directions at 90 degrees or more off its axis,
+for which no such ray exists. Its frame is therefore turned until the keypoints lie in front of it,
+and the estimate is turned back. This works unless the object surrounds the camera.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from cadalign.geometry.pixels import (
 
 
 class Camera(Calibration):
-    """A calibrated camera: a pinhole, with lens distortion or without, or a wide lens.
+    """A calibrated camera with a perspective lens or a fisheye, with or without distortion.
 
-    Camera axes are OpenCV's: x right, y down, z forward. Integer pixel coordinates are pixel
-    centres: the top-left pixel's centre is (0, 0), the image spans [-0.5, width - 0.5].
+    Camera axes follow OpenCV: x right, y down, z forward. Integer pixel coordinates are pixel
+    centres: the top-left pixel's centre is (0, 0), and the image spans [-0.5, width - 0.5].
 
     Parameters
     ----------
@@ -44,20 +44,21 @@ class Camera(Calibration):
     cx, cy : float
         Principal point [px].
     distortion : tuple of float, optional
-        For a perspective lens OpenCV's coefficients in OpenCV's order and shapes: (k1, k2, p1, p2),
-        or with k3, or with k3, k4, k5, k6; empty for none. Its further ones must be 0. For a
-        fisheye (k1, k2, k3, k4) as in ``cv2.fisheye``, 0 by default.
+        OpenCV's coefficients in OpenCV's order and shapes. For a perspective lens
+        (k1, k2, p1, p2), optionally followed by k3 or by k3, k4, k5, k6; empty for no distortion.
+        OpenCV's further coefficients must be 0. For a fisheye (k1, k2, k3, k4) as in
+        ``cv2.fisheye``, all 0 by default.
     lens : {"perspective", "fisheye"}
-        Kind of lens. A fisheye may see points beside and behind the camera's plane; its focal
-        length has to be known.
+        Kind of lens. A fisheye may see points beside and behind the camera. Its focal length must
+        be known.
     focal_known : bool
-        False for a camera whose focal lengths are placeholders; see `without_focal`.
+        False if the focal lengths are placeholders; see `without_focal`.
 
     Raises
     ------
     InputError
         If a size is not a positive integer, a focal length is missing or not positive, a value is
-        not finite, or the coefficients are not those of the lens.
+        not finite, or the coefficients don't fit the lens.
 
     Examples
     --------
@@ -70,10 +71,15 @@ class Camera(Calibration):
     """
 
     def turned(self, rotation: npt.ArrayLike) -> Camera:
-        """The same camera of a wide lens, its points in a frame that is turned about its centre.
+        """Turn the frame of a camera with a wide lens about the camera centre.
 
-        The rotation (3, 3) leads from this camera's frame to the new one. Image and lens stay where
-        they are: the new frame's z axis is not the optical axis.
+        ``rotation`` (3, 3) maps this camera's frame to the new one. The image and the lens do not
+        change, so the new frame's z axis is not the optical axis.
+
+        Raises
+        ------
+        InputError
+            If the lens is not wide.
 
         Examples
         --------
@@ -83,25 +89,24 @@ class Camera(Calibration):
         True
         """
         if not self.is_wide:
-            raise InputError("the frame of a pinhole is its own", where="camera.lens")
+            raise InputError("a perspective camera cannot be turned", where="camera.lens")
         rows = as_floats(rotation, name="rotation", shape=(3, 3))
         return replace(self, turn=tuple((self.lens_from_camera @ rows.T).ravel().tolist()))
 
     @property
     def lens_from_camera(self) -> FloatArray:
-        """Rotation (3, 3) from the camera's frame to the lens's; see `turned`."""
+        """Rotation (3, 3) from the camera's frame to the lens's frame; see `turned`."""
         return np.array(self.turn).reshape(3, 3) if self.turn else np.eye(3)
 
     @property
     def is_wide(self) -> bool:
-        """True for a lens that may see points beside and behind its plane."""
+        """True for a lens that may see points beside and behind the camera."""
         return self.lens != "perspective"
 
     def sees(self, points_cam: FloatArray) -> BoolArray:
-        """Say which points (n, 3) of the camera frame have a projection, in the image or not.
+        """Mask (n,) of the camera-frame points (n, 3) that have a projection, in the image or not.
 
-        For a pinhole those in front of its plane; for a wide lens those up to the angle from the
-        axis at which the image of farther directions would turn back.
+        A perspective lens sees points with z > 0, a wide lens points up to `largest_angle`.
         """
         points = points_cam @ self.lens_from_camera.T if self.turn else points_cam
         if not self.is_wide:
@@ -110,13 +115,13 @@ class Camera(Calibration):
         return np.asarray((angle < largest_angle(self.distortion)) & points.any(axis=1))
 
     def project(self, points_cam: npt.ArrayLike) -> FloatArray:
-        """Project points (n, 3) of the camera frame to pixels (n, 2), in the image or beside it.
+        """Project camera-frame points (n, 3) to pixels (n, 2), inside the image or outside.
 
         Raises
         ------
         InputError
-            If a point lies in or behind the camera's plane (z <= 0), or outside the field of a
-            wide lens, or the focal length is unknown.
+            If a point has z <= 0 (perspective lens) or lies outside the field of view (wide lens),
+            or the focal length is unknown.
         """
         self.require_focal()
         points = as_points(points_cam, name="points_cam", dimension=3)
@@ -124,7 +129,7 @@ class Camera(Calibration):
         if self.is_wide:
             limit = np.degrees(largest_angle(self.distortion))
             what, which = (
-                "{} points lie outside the lens's field",
+                "{} points lie outside the lens's field of view",
                 f"less than {limit:.4g} degrees ",
             )
             which += "off the axis"
@@ -133,7 +138,7 @@ class Camera(Calibration):
         return self.pixels_of_rays(points)
 
     def project_where_ahead(self, points_cam: FloatArray) -> FloatArray:
-        """Project points (n, 3) of the camera frame; infinite pixels (n, 2) where not seen."""
+        """Project camera-frame points (n, 3) to pixels (n, 2), infinite for unseen points."""
         ahead = self.sees(points_cam)
         if ahead.all():
             return self.pixels_of_rays(points_cam)
@@ -142,8 +147,8 @@ class Camera(Calibration):
         return pixels
 
     def pixels_of_rays(self, rays: FloatArray) -> FloatArray:
-        """Pixels (n, 2) of directions (n, 3) that the camera `sees`, of any length."""
-        with np.errstate(over="ignore", invalid="ignore"):  # far outside the lens model's field
+        """Pixels (n, 2) of directions (n, 3) of any length, all of which the camera `sees`."""
+        with np.errstate(over="ignore", invalid="ignore"):  # far outside the lens model's range
             if self.is_wide:
                 image, _ = image_of(rays @ self.lens_from_camera.T, self.lens, self.distortion)
             else:
@@ -153,15 +158,15 @@ class Camera(Calibration):
             return image * (self.fx, self.fy) + (self.cx, self.cy)
 
     def projection_slopes(self, points_cam: FloatArray) -> FloatArray:
-        """Derivatives (n, 2, 3) of pixels by points (n, 3) that the camera `sees`."""
+        """Derivatives (n, 2, 3) of pixels by points (n, 3), all of which the camera `sees`."""
         lens_from_camera = self.lens_from_camera
         slopes = image_of(points_cam @ lens_from_camera.T, self.lens, self.distortion)[1]
         return np.asarray(np.array([[self.fx], [self.fy]]) * (slopes @ lens_from_camera))
 
     def projected_covariances(self, points_cam: FloatArray, covariances: FloatArray) -> FloatArray:
-        """Covariances (n, 2, 2) [px squared] of projections of uncertain points, to first order.
+        """Propagate covariances (n, 3, 3) of points to their pixels, to first order.
 
-        The points (n, 3) are some that the camera `sees`, their covariances are (n, 3, 3).
+        The camera must see all points (n, 3). Returns covariances (n, 2, 2) [px squared].
 
         Examples
         --------
@@ -173,7 +178,7 @@ class Camera(Calibration):
         return np.asarray(slopes @ covariances @ slopes.swapaxes(1, 2))
 
     def unproject(self, points_2d: npt.ArrayLike) -> FloatArray:
-        """Directions of the rays of pixels (n, 2) in the camera frame, unit vectors (n, 3).
+        """Convert pixels (n, 2) to unit direction vectors (n, 3) in the camera frame.
 
         For a wide lens, z may be 0 or negative.
 
@@ -190,13 +195,14 @@ class Camera(Calibration):
         """
         self.require_focal()
         rays, valid = self.rays_where_valid(points_2d)
-        _refuse(~valid, *_NOT_UNDONE)
+        _refuse(~valid, *_NOT_INVERTIBLE)
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def rays_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """Directions (n, 3) of pixels (n, 2), and where they exist (n,): elsewhere without meaning.
+        """Convert pixels (n, 2) to directions (n, 3), with a mask (n,) of the valid ones.
 
-        They have z = 1 for a pinhole and the length 1 for a wide lens.
+        Directions have z = 1 for a perspective lens and length 1 for a wide lens. Invalid ones
+        are meaningless.
         """
         points = as_points(points_2d, name="points_2d", dimension=2)
         valid = np.full(len(points), True)
@@ -210,28 +216,29 @@ class Camera(Calibration):
         return _homogeneous(image), valid
 
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:
-        """Turn pixels (n, 2) into normalised image coordinates, the lens distortion removed.
+        """Convert pixels (n, 2) to normalised image coordinates (n, 2), without distortion.
 
-        These are (n, 2), such that (u, v, 1) is the direction of the pixel's ray.
+        The direction of a pixel's ray is (u, v, 1).
 
         Raises
         ------
         InputError
-            If the lens model cannot be inverted at a pixel (far outside the calibrated image), if
-            its ray is 90 degrees or more off the z axis (see `unproject`), or the focal length is
+            If the lens model cannot be inverted at a pixel (far outside the calibrated image), a
+            ray is 90 degrees or more off the z axis (see `unproject`), or the focal length is
             unknown.
         """
         self.require_focal()
         rays, valid = self.rays_where_valid(points_2d)
-        _refuse(~valid, *_NOT_UNDONE)
+        _refuse(~valid, *_NOT_INVERTIBLE)
         what = "the rays of {} pixels are 90 degrees or more off the z axis"
         _refuse(rays[:, 2] <= 0, what, "these have no normalised coordinates; use unproject")
         return perspective(rays)
 
     def normalize_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """Turn pixels (n, 2) into normalised image coordinates where the lens can be inverted.
+        """Convert pixels (n, 2) to normalised image coordinates where the lens can be inverted.
 
-        Returns what `normalize` does, meaningless but finite elsewhere, and where it is valid (n,).
+        Returns coordinates (n, 2) as `normalize` does, and a mask (n,) of the valid ones. Invalid
+        coordinates are finite but meaningless.
         """
         rays, valid = self.rays_where_valid(points_2d)
         behind = rays[:, 2] <= 0
@@ -239,11 +246,11 @@ class Camera(Calibration):
         return perspective(rays), np.asarray(valid & ~behind)
 
     def pixels_from_normalized(self, normalized: FloatArray) -> FloatArray:
-        """Apply lens and calibration matrix to (n, 2) normalised coordinates; gives pixels."""
+        """Convert normalised image coordinates (n, 2) to pixels (n, 2)."""
         return self.pixels_of_rays(_homogeneous(normalized))
 
     def distortion_jacobian(self, normalized: FloatArray) -> FloatArray:
-        """Derivatives (n, 2, 2) of pixels, over focal lengths, by normalised coordinates (n, 2)."""
+        """Derivatives (n, 2, 2) of pixels / focal length by normalised coordinates (n, 2)."""
         if not self.distortion:
             return np.broadcast_to(np.eye(2), (len(normalized), 2, 2))
         if self.is_wide:
@@ -253,7 +260,7 @@ class Camera(Calibration):
 
 
 def needs_facing(cameras: Sequence[Camera]) -> bool:
-    """True if any of the cameras has a wide lens whose frame faces nothing yet."""
+    """True if any camera has a wide lens and its frame has not been turned yet."""
     return True in [camera.is_wide and not camera.turn for camera in cameras]
 
 
@@ -262,53 +269,54 @@ def _homogeneous(normalized: FloatArray) -> FloatArray:
 
 
 def _refuse(odd: BoolArray, what: str, fix: str, *, where: str = "points_2d") -> None:
-    """Refuse rows (n,), of which ``what`` is said; its place is for their number."""
+    """Raise an InputError if any row of ``odd`` (n,) is True; ``what`` has a slot for the count."""
     rows = np.flatnonzero(odd)
     if len(rows):
         what = what.format(f"{len(rows)} of {len(odd)}")
         raise InputError(f"{what}, the first is point {rows[0]}", where=where, fix=fix)
 
 
-_NOT_UNDONE = (
+_NOT_INVERTIBLE = (
     "the lens distortion cannot be undone at {} pixels",
     "these lie outside the area in which the lens model is valid; drop them",
 )
-_REACH = 85.0  # of rays off the facing axis [degrees]
-_OF_OBJECT = 60.0  # half the angle under which an object is seen that stray keypoints go beyond
+_MOST_OFF_AXIS = 85.0  # angle between a ray and the facing axis [degrees]
+_OBJECT_HALF_ANGLE = 60.0  # keypoints farther from the object's direction are outliers [degrees]
 _CANDIDATES = 200
 _ROUNDS = 64
-_OF_A_RESULT = 10  # unknowns of a result's covariance, focal length included
+_RESULT_UNKNOWNS = 10  # of a result's covariance, focal length included
 
 
 def faced(camera: Camera, points_2d: FloatArray) -> Camera:
-    """The camera turned to pixels (n, 2); a pinhole, or one that is turned, as it is.
+    """Turn a camera with a wide lens so that its z axis faces pixels (n, 2), or most of them.
 
-    ``lens_from_camera`` is the rotation that turns back what is found in its frame. Where the
-    pixels' rays are too far apart, it faces most of them.
+    A perspective or already turned camera is returned unchanged. ``lens_from_camera`` of the
+    result rotates estimates back to the original frame.
     """
     if not needs_facing([camera]):
         return camera
     rays, valid = camera.rays_where_valid(points_2d)
-    axis = _axis_amid(rays[valid]) if valid.any() else np.array([0.0, 0.0, 1.0])
+    axis = _facing_axis(rays[valid]) if valid.any() else np.array([0.0, 0.0, 1.0])
     across = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0], axis)
     across /= np.linalg.norm(across)
     return camera.turned([across, np.cross(axis, across), axis])
 
 
-def _axis_amid(rays: FloatArray) -> FloatArray:
-    """The axis of the narrowest cone about unit vectors (n, 3), or about most of them."""
+def _facing_axis(rays: FloatArray) -> FloatArray:
+    """Axis of the narrowest cone around unit vectors (n, 3), or around most of them."""
     axis = _cone_axis(rays)
-    if (rays @ axis).min() > math.cos(math.radians(_REACH)):
+    if (rays @ axis).min() > math.cos(math.radians(_MOST_OFF_AXIS)):
         return axis
     candidates = rays[:: math.ceil(len(rays) / _CANDIDATES)]
-    near = candidates @ rays.T > math.cos(math.radians(_OF_OBJECT))
+    near = candidates @ rays.T > math.cos(math.radians(_OBJECT_HALF_ANGLE))
     return _cone_axis(rays[near[near.sum(axis=1).argmax()]])
 
 
 def _cone_axis(rays: FloatArray) -> FloatArray:
-    """The axis of the narrowest cone: the centre of the smallest ball that holds the unit vectors.
+    """Axis of the narrowest cone around unit vectors: the direction of their ball's centre.
 
-    By Badoiu and Clarkson's iteration ("Smaller core-sets for balls", 2003).
+    The smallest enclosing ball is found by Badoiu and Clarkson's iteration ("Smaller core-sets for
+    balls", 2003).
     """
     center = rays.mean(axis=0)
     for k in range(_ROUNDS):
@@ -319,19 +327,18 @@ def _cone_axis(rays: FloatArray) -> FloatArray:
 
 
 def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
-    """Rays (n, 2) of the pixels (n, 2) of a wide lens, in the frame that the camera faces.
+    """Normalised coordinates (n, 2) of pixels (n, 2) in the frame of a camera that was `faced`.
 
-    With ``clips``, rays beside the frame's field are moved to its border: those of outliers.
-    Raises InputError if the lens model cannot be inverted at a pixel, or a ray lies beside the
-    field.
+    ``clips`` moves rays more than 85 degrees off the z axis to 85 degrees; otherwise they raise
+    InputError. So do pixels at which the lens model cannot be inverted.
     """
     rays = camera.unproject(points_2d)
-    border = math.radians(_REACH)
+    border = math.radians(_MOST_OFF_AXIS)
     beside = rays[:, 2] < math.cos(border)
     if not clips:
         what = "the keypoints surround the camera: {} lie more than "
-        what += f"{_REACH:g} degrees off the direction amid them"
-        fix = "give keypoints on one side of the camera, or, if these are outliers, ransac"
+        what += f"{_MOST_OFF_AXIS:g} degrees off their central direction"
+        fix = "give keypoints on one side of the camera, or, if these are outliers, use ransac"
         _refuse(beside, what, fix)
     across = rays[beside, :2] / np.linalg.norm(rays[beside, :2], axis=1, keepdims=True)
     rays[beside, :2], rays[beside, 2] = math.sin(border) * across, math.cos(border)
@@ -339,13 +346,13 @@ def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) ->
 
 
 def turned_alignment(alignment: Alignment, rotation: FloatArray) -> Alignment:
-    """The alignment in a camera frame to which ``rotation`` (3, 3) leads."""
+    """Transform an alignment by the ``rotation`` (3, 3) from its camera frame to a new one."""
     turned = rotation @ alignment.rotation, rotation @ alignment.translation
     return Alignment(*turned, alignment.scale, is_valid=True)
 
 
 def turned_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Packed poses (..., 15) in a camera frame to which ``rotation`` (3, 3) leads."""
+    """Transform packed poses (..., 15) by the ``rotation`` (3, 3) to a new camera frame."""
     turned = packed.copy()
     columns = packed[..., :9].reshape(*packed.shape[:-1], 3, 3)
     turned[..., :9] = (rotation @ columns).reshape(*packed.shape[:-1], 9)
@@ -354,23 +361,24 @@ def turned_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def turned_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
-    """A covariance (..., m, m) of rotation vector, translation and others in such a frame."""
+    """Transform a pose's covariance (..., m, m), m >= 6, by the ``rotation`` (3, 3)."""
     turn = np.eye(covariance.shape[-1])
     turn[:3, :3] = turn[3:6, 3:6] = rotation
     return np.asarray(turn @ covariance @ turn.T)
 
 
 def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
-    """Derivatives (n, 2, 10) of projected points, in the order of `cadalign.Result.covariance`.
+    """Derivatives (n, 2, 10) of projected points by the unknowns of `cadalign.Result.covariance`.
 
-    In pixels per rad, model unit, and unit of a logarithm. Refuses points behind the camera.
+    Units: pixels per rad, per model unit, and per unit of a logarithm. Raises InputError if a point
+    lies behind the camera.
     """
     in_camera = alignment.apply(points_3d)
     if not camera.sees(in_camera).all():
         raise InputError("a point lies behind the camera", where="points_3d")
     stretched = points_3d * alignment.scale
     turned = stretched @ alignment.rotation.T
-    jacobian = np.empty((len(points_3d), 2, _OF_A_RESULT))
+    jacobian = np.empty((len(points_3d), 2, _RESULT_UNKNOWNS))
     by_point = camera.projection_slopes(in_camera)
     jacobian[:, :, :3] = np.cross(turned[:, None], by_point)
     jacobian[:, :, 3:6] = by_point

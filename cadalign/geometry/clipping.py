@@ -1,4 +1,4 @@
-"""Intersection of two boxes: one box's edges, cut off at the faces of the other, and the volume."""
+"""Intersection of two oriented boxes: clipped edges and volume."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 
-_PARALLEL = 1e-14  # share of an edge's length that its direction must have across a face
-_CORNERS = 42  # of a polygon after 6 cuts: 10, and no more than these however sums are rounded
+_PARALLEL = 1e-14  # component across a face, over the edge's length, of a parallel edge
+_CORNERS = 42  # bound on a polygon's corners after 6 cuts: 10 without rounding
 _NODE = 1.0 / np.sqrt(3.0)
 
 
 @kernel
-def clipped_edges(
+def clip_edges(
     extents: FloatArray, clip: FloatArray, axes: FloatArray, center: FloatArray, ends: FloatArray
 ) -> int:
-    """Write the ends of those parts of a box's edges that lie inside another box; their number.
+    """Clip a box's edges to another box; write their ends and return the number of ends.
 
-    The boxes have the side lengths ``extents`` and ``clip``; ``axes`` (columns), ``center`` and
-    ``ends`` (24, 3) of the first are in the frame of the second.
+    The boxes have the side lengths ``extents`` and ``clip``. ``axes`` (columns), ``center`` and
+    ``ends`` (24, 3) of the first box are in the frame of the second.
     """
     count = 0
     start = np.empty(3)
@@ -55,15 +55,14 @@ def intersection_volume(
 ) -> float:
     """Compute the volume of the intersection of two boxes.
 
-    The boxes have the side lengths ``first`` and ``second``; ``axes`` (columns) and ``center`` of
-    the second are in the frame of the first. A vertex of the intersection lies on an edge of one
-    box, where that edge enters or leaves the other. Between the vertices' x coordinates the area of
-    a section at x is quadratic, so that Gauss' rule with two nodes integrates it exactly. It has no
-    special cases: boxes may share faces, edges or corners.
+    The boxes have the side lengths ``first`` and ``second``. ``axes`` (columns) and ``center`` of
+    the second are in the frame of the first. Vertices of the intersection are ends of clipped
+    edges. Between the vertices' x coordinates, the area of the section at x is quadratic, so Gauss'
+    rule with two nodes integrates it exactly. Boxes may share faces, edges or corners.
     """
     ends = np.empty((24, 3))
     places = np.empty(48)
-    count = clipped_edges(second, first, axes, center, ends)
+    count = clip_edges(second, first, axes, center, ends)
     for i in range(count):
         places[i] = ends[i, 0]
     back = np.empty((3, 3))
@@ -72,7 +71,7 @@ def intersection_volume(
         for j in range(3):
             back[i, j] = axes[j, i]
             origin[i] -= axes[j, i] * center[j]
-    more = clipped_edges(first, second, back, origin, ends)
+    more = clip_edges(first, second, back, origin, ends)
     for i in range(more):
         x = center[0]
         for j in range(3):

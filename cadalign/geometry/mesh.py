@@ -1,4 +1,4 @@
-"""Triangle meshes: faces in file order, their colours and textures, and samples of surfaces."""
+"""Triangle meshes with colours and textures, and points on their surfaces."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cadalign.errors import DataError, InputError
 GREY = (0.7, 0.7, 0.7, 1.0)
 _DAMAGED = "the file is cut short or damaged"
 
-# Units of a model's keypoints and of its mesh: both are in the model's coordinates.
-_MARGIN = 0.3  # by which keypoints may lie outside of the mesh's box [its diagonals]
-_FAR = 1.0  # from which on they are another model's
-_LEAST_SHARE = 0.3  # of the mesh's diagonal that keypoints span once they are in its unit
-_SMALL = 0.05  # share from which down they may be in a larger unit
+# Thresholds on keypoints relative to the mesh's diagonal, to find wrong units.
+_MARGIN = 0.3  # distance by which keypoints may lie outside the mesh's box
+_FAR = 1.0  # distance beyond which keypoints belong to another model
+_LEAST_SHARE = 0.3  # least span of keypoints in the mesh's unit
+_SMALL = 0.05  # span below which keypoints may be in a larger unit
 _UNITS = {
     1000.0: "in millimetres beside a mesh in metres",
     100.0: "in centimetres beside a mesh in metres",
@@ -28,19 +28,19 @@ _UNITS = {
     0.01: "in metres beside a mesh in centimetres",
     0.001: "in metres beside a mesh in millimetres",
 }
-"""By how many times larger keypoints are than the mesh: the likely units."""
+"""Likely units, by the size of the keypoints over the size of the mesh."""
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Look of a part of a surface."""
+    """Appearance of a part of a surface."""
 
     name: str = ""
     """The material's name in its file."""
     color: tuple[float, float, float, float] = GREY
-    """Red, green, blue and opacity, 0 to 1; multiplied with the texture where there is one."""
+    """Red, green, blue and opacity, 0 to 1; multiplied with the texture if there is one."""
     texture: npt.NDArray[np.uint8] | None = None
-    """The image (h, w, 3 or 4), its first row at the top; texture coordinates start at the bottom
+    """Image (h, w, 3 or 4), first row at the top. Texture coordinates (0, 0) are its bottom
     left."""
 
 
@@ -51,27 +51,27 @@ class Mesh:
     Raises
     ------
     DataError
-        If there are no faces, an index is out of range, a vertex is not finite, or arrays don't
-        match in length.
+        If there are no faces, an index is out of range, a vertex is not finite, or shapes don't
+        match.
     """
 
     vertices: FloatArray
     """Positions (n, 3) [model units]."""
     faces: IntArray
-    """Vertex numbers of the triangles (m, 3), in the order of the file."""
+    """Vertex numbers of the triangles (m, 3), in file order."""
     polygon: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """The number (m,), in the file, of the face that a triangle was cut from: a quad gives two
-    triangles with the same number. By default ``0 ... m - 1``."""
+    """Number (m,) of each triangle's face in the file: the two triangles of a quad share one. By
+    default ``0 ... m - 1``."""
     vertex_colors: FloatArray | None = None
     """Red, green, blue and opacity (n, 4), 0 to 1."""
     corner_uv: FloatArray | None = None
     """Texture coordinates of each triangle's corners (m, 3, 2)."""
     materials: tuple[Material, ...] = (Material(),)
-    """The materials that ``face_material`` names."""
+    """Materials that ``face_material`` indexes."""
     face_material: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """Which material a triangle has (m,); by default the first of all."""
+    """Index of each triangle's material (m,); by default 0."""
     source: str = "mesh"
-    """The file or id the mesh comes from, for messages."""
+    """File or id that the mesh comes from, for messages."""
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -114,7 +114,7 @@ class Mesh:
         polygon_material: IntArray | None = None,
         **fields: Any,
     ) -> Mesh:
-        """Make a mesh of polygons, each cut into a fan of triangles.
+        """Make a mesh from polygons; each is cut into a fan of triangles.
 
         Parameters
         ----------
@@ -123,18 +123,18 @@ class Mesh:
         corners : (c,) int
             Vertex numbers of all polygons' corners, one polygon after the other.
         sizes : (p,) int
-            Numbers of corners of the polygons, at least 3.
+            Number of corners of each polygon, at least 3.
         corner_uv : (c, 2) float, optional
             Texture coordinates of the corners.
         polygon_material : (p,) int, optional
-            Which material a polygon has.
+            Index of each polygon's material.
         **fields
             Further fields of the mesh.
 
         Raises
         ------
         DataError
-            As `Mesh`, or if a polygon has fewer than 3 corners.
+            See `Mesh`; also if a polygon has fewer than 3 corners.
         """
         if len(sizes) and sizes.min() < 3:
             what = f"face {int(sizes.argmin())} has {sizes.min()} corners"
@@ -152,35 +152,35 @@ class Mesh:
 
     @property
     def bounds(self) -> FloatArray:
-        """Lowest and highest coordinates of the vertices that faces use, (2, 3) float."""
+        """Least and greatest coordinates of the vertices that faces use, (2, 3) float."""
         used = self.vertices[self.is_used]
         return np.array([used.min(axis=0), used.max(axis=0)])
 
     @property
     def is_used(self) -> BoolArray:
-        """The vertices that faces use, (n,) bool."""
+        """Mask of the vertices that faces use, (n,) bool."""
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.faces] = True
         return used
 
     @property
     def triangles(self) -> FloatArray:
-        """The corners of all triangles, (m, 3, 3) float."""
+        """Corners of all triangles, (m, 3, 3) float."""
         return np.asarray(self.vertices[self.faces])
 
     def stretched(self, scale: npt.ArrayLike) -> Mesh:
-        """The same mesh with its axes multiplied by ``scale`` (3,)."""
+        """Multiply the coordinates by ``scale`` (3,); returns a new mesh."""
         return replace(self, vertices=self.vertices * np.asarray(scale, dtype=float))
 
     def surface_points(self, face_index: npt.ArrayLike, barycentric: npt.ArrayLike) -> FloatArray:
-        """Points on the surface from the file's face numbers and barycentric coordinates.
+        """Points on the surface from face numbers and barycentric coordinates.
 
         Parameters
         ----------
         face_index : (k,) int
-            Numbers of faces in the file's order; of a polygon its first triangle counts.
+            Face numbers in the file. For a polygon its first triangle is used.
         barycentric : (k, 3) float
-            Weights of the face's corners in file order; normalised to the sum 1.
+            Weights of the face's corners in file order; they are normalised to sum to 1.
 
         Returns
         -------
@@ -204,7 +204,7 @@ class Mesh:
         return np.asarray(np.einsum("kc,kcd->kd", weights, self.triangles[triangle]))
 
     def closest(self, points: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
-        """Triangle and barycentric coordinates of the surface's nearest point to each of these.
+        """Triangle and barycentric coordinates of the surface point nearest to each point.
 
         Parameters
         ----------
@@ -213,7 +213,7 @@ class Mesh:
         Returns
         -------
         (k,) int, (k, 3) float
-            As `surface_points` takes them for a mesh of triangles.
+            Arguments for `surface_points` of a mesh of triangles.
         """
         import trimesh
 
@@ -238,7 +238,7 @@ class Mesh:
 
 
 def join(pieces: Sequence[Mesh], source: str) -> Mesh:
-    """Put meshes together, such as those of a file, faces one after the other."""
+    """Concatenate meshes, for example those of a file."""
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     materials = list(dict.fromkeys(each for piece in pieces for each in piece.materials))
     number = {each: k for k, each in enumerate(materials)}
@@ -262,9 +262,10 @@ def join(pieces: Sequence[Mesh], source: str) -> Mesh:
 
 
 def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:
-    """Colours (n, 4) of a mesh's vertices; where it has none, its materials' or a palette's (k, 4).
+    """Vertex colours (n, 4) of a mesh.
 
-    The palette has a colour for each material.
+    A mesh without vertex colours gets those of its materials, or of a palette (k, 4) with a colour
+    for each material.
     """
     if mesh.vertex_colors is not None:
         return mesh.vertex_colors
@@ -278,7 +279,7 @@ def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:
 def barycentric_of(triangles: FloatArray, points: FloatArray) -> FloatArray:
     """Barycentric coordinates (n, 3) of points (n, 3) in triangles (n, 3, 3).
 
-    They are not finite where a triangle has no area.
+    They are not finite for triangles without area.
     """
     edges, offsets = triangles[:, 1:] - triangles[:, :1], points - triangles[:, 0]
     a, b = np.einsum("nik,nk->in", edges, offsets)
@@ -289,14 +290,14 @@ def barycentric_of(triangles: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def face_normals(triangles: FloatArray) -> FloatArray:
-    """Unit normals of triangles (m, 3, 3), (m, 3) float; zero for one without area."""
+    """Unit normals of triangles (m, 3, 3), (m, 3) float; zero for triangles without area."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(normals / np.where(length > 0, length, 1.0))
 
 
 def check_near(points_3d: FloatArray, bounds: FloatArray, *, where: str) -> None:
-    """Refuse keypoints (k, 3) that lie far from their mesh, with the factor if it is a unit's.
+    """Refuse keypoints that lie far from their mesh; the message names a likely unit mistake.
 
     Parameters
     ----------
@@ -310,37 +311,37 @@ def check_near(points_3d: FloatArray, bounds: FloatArray, *, where: str) -> None
     Raises
     ------
     InputError
-        If the keypoints fit the mesh in another unit only, or one lies more than a diagonal from
-        the mesh's box.
+        If the keypoints fit the mesh only in another unit, or a keypoint lies more than a diagonal
+        away from the mesh's box.
     """
     diagonal = float(np.linalg.norm(bounds[1] - bounds[0]))
     if not len(points_3d) or not diagonal > 0:
         return
     span = float(np.linalg.norm(np.ptp(points_3d, axis=0)))
-    outside = _outside(points_3d, bounds)
+    outside = _distances_from_box(points_3d, bounds)
     if outside.max() > _MARGIN * diagonal or span < _SMALL * diagonal:
         fitting = [
             factor
             for factor in _UNITS
             if span >= _LEAST_SHARE * factor * diagonal
-            and _outside(points_3d / factor, bounds).max() <= _MARGIN * diagonal
+            and _distances_from_box(points_3d / factor, bounds).max() <= _MARGIN * diagonal
         ]
         if fitting and span > 0:
             factor = min(fitting, key=lambda each: abs(np.log(span / (each * diagonal))))
             raise InputError(
-                f"the keypoints span {span:.3g} model units, the mesh {diagonal:.3g}: they fit it "
-                f"divided by {factor:g}, as keypoints {_UNITS[factor]}",
+                f"the keypoints span {span:.3g} model units, the mesh {diagonal:.3g}: they fit "
+                f"if divided by {factor:g}, as keypoints {_UNITS[factor]} do",
                 where=where,
                 fix=f"give both in one unit: multiply the keypoints by {1 / factor:g}",
             )
     if outside.max() > _FAR * diagonal:
         row = int(outside.argmax())
-        what = f"keypoint {row} lies {outside[row] / diagonal:.3g} diagonals of the mesh from it"
+        what = f"keypoint {row} lies {outside[row] / diagonal:.3g} mesh diagonals from the mesh"
         fix = "give the keypoints and the mesh of one model, in the same coordinates"
         raise InputError(what, where=where, fix=fix)
 
 
-def _outside(points: FloatArray, bounds: FloatArray) -> FloatArray:
+def _distances_from_box(points: FloatArray, bounds: FloatArray) -> FloatArray:
     """Distances (k,) of points (k, 3) from a box, 0 inside."""
     beyond = np.maximum(bounds[0] - points, points - bounds[1]).clip(0)
     return np.asarray(np.linalg.norm(beyond, axis=1))

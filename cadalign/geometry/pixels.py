@@ -1,12 +1,13 @@
-"""Pixels, their conventions, and lenses: places of directions in the image, and the inverse.
+"""Pixel conventions and lens models: from directions to image coordinates and back.
 
-The place of a direction is in focal lengths, from the principal point. With theta the angle between
-a direction and the optical axis and n its unit vector across the axis, a lens first maps
+Image coordinates are relative to the principal point, in focal lengths. Let theta be the angle
+between a direction and the optical axis, and n the direction's unit vector across the axis. A lens
+first maps the direction
 
 - ``perspective``: to tan(theta) n, for theta below 90 degrees,
 - ``fisheye``: to theta n (Kannala, Brandt, "A generic camera model and calibration method", 2006),
 
-and then adds distortion: OpenCV's model with k1, k2, p1, p2, k3 to k6, or that of ``cv2.fisheye``.
+and then adds distortion: OpenCV's model with k1, k2, p1, p2, k3 to k6, or ``cv2.fisheye``'s.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError, quote
 
 PIXEL_CENTRE = 0.5
-"""The centre of the top-left pixel, in x and y, in OpenGL, COLMAP and NeRF programs."""
-_NORMALISED = 1.5  # beyond all normalised coordinates of what is guessed outside of an image [px]
-_PLACEHOLDERS = (0.0, -1.0)  # of both coordinates of a keypoint that was not found
-_SEVERAL = 2  # of these, which no detector finds by chance
-_CROWD = 3  # keypoints at one and the same pixel
-_CROWDED_SPAN = 32  # of an object in which so many do not meet [px]
-_LEAST_SIZE = 16  # of an image in which so small an object is a mistake [px]
+"""Coordinates x and y of the top-left pixel's centre in OpenGL, COLMAP and NeRF programs."""
+_MOST_NORMALISED = 1.5  # normalised coordinates are smaller, even outside the image [px]
+_PLACEHOLDERS = (0.0, -1.0)  # both coordinates of keypoints that a detector did not find
+_LEAST_PLACEHOLDERS = 2  # equal rows that are not a coincidence
+_CROWD = 3  # keypoints at the same pixel
+_CROWDED_SPAN = 32  # of an object whose keypoints do not coincide by chance [px]
+_LEAST_SIZE = 16  # of an image in which an object of a pixel or so is a mistake [px]
 
 PixelOrigin = Literal["center", "corner"]
-"""Place of pixel (0, 0): the centre of the top-left pixel, or the image's top-left corner."""
+"""Position of (0, 0): the centre of the top-left pixel, or the image's top-left corner."""
 
 
 def shift_of(pixel_origin: object, *, where: str = "pixel_origin") -> float:
-    """Coordinates of the top-left pixel's centre under a convention [px]: 0 or 0.5."""
+    """Coordinate of the top-left pixel's centre in a convention [px]: 0 or 0.5."""
     if not isinstance(pixel_origin, str) or pixel_origin not in get_args(PixelOrigin):
         fix = 'give "center" (of the top-left pixel) or "corner" (of the image)'
         what = f"{quote(pixel_origin)} is not a place of pixel (0, 0)"
@@ -45,19 +46,18 @@ def shift_of(pixel_origin: object, *, where: str = "pixel_origin") -> float:
 
 
 def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArray:
-    """Pixels (n, 2), or coordinates (n,), in an image ``factor`` times as large.
+    """Pixels (n, 2), or coordinates (n,), after the image is resized by ``factor``.
 
-    Borders stay in place, centres do not.
+    The image's borders are fixed, pixel centres are not.
     """
     return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
 
 
-def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
-    """Say which rows of pixels (n, 2) are no measurements, (n,) bool.
+def unmeasured(points_2d: FloatArray, *, least: int = _LEAST_PLACEHOLDERS) -> BoolArray:
+    """Mask (n,) of pixels (n, 2) that detectors write for keypoints that they did not find.
 
-    These are what detectors write for keypoints that they did not find: values that are not finite;
-    exactly (0, 0) or (-1, -1), if it is written ``least`` times; and a pixel that three or more
-    share.
+    These are values that are not finite; exactly (0, 0) or (-1, -1) if it occurs at least ``least``
+    times; and a pixel that three or more keypoints share.
     """
     bad = np.asarray(~np.isfinite(points_2d).all(axis=1))
     for _, here in _placeholders(points_2d, least):
@@ -72,10 +72,10 @@ def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
 
 
 def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) -> None:
-    """Refuse what is no pixels (n, 2) of an image of that size.
+    """Check that points (n, 2) are pixels of an image of the given size.
 
-    Raises InputError if several are placeholders of detectors, see `unmeasured`, or if all are
-    normalised coordinates: within a pixel or so of the image's corner, but not in one place.
+    Raises InputError if several are detectors' placeholders (see `unmeasured`), or if all are
+    normalised coordinates: distinct and within about a pixel of the image's corner.
 
     Examples
     --------
@@ -86,18 +86,18 @@ def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) 
     if not len(points_2d):
         return
     _refuse_placeholders(points_2d, where)
-    if abs(points_2d.item(0)) > _NORMALISED:
+    if abs(points_2d.item(0)) > _MOST_NORMALISED:
         return
     if min(width, height) < _LEAST_SIZE or not np.ptp(points_2d, axis=0).any():
         return
-    if np.abs(points_2d).max() <= _NORMALISED:
-        what = f"all {len(points_2d)} keypoints lie within {_NORMALISED:g} px of pixel (0, 0)"
+    if np.abs(points_2d).max() <= _MOST_NORMALISED:
+        what = f"all {len(points_2d)} keypoints lie within {_MOST_NORMALISED:g} px of pixel (0, 0)"
         fix = f"give pixels: multiply fractions by the image's width {width} and height {height}"
         raise InputError(f"{what}, as normalised coordinates (0 to 1) do", where=where, fix=fix)
 
 
 def _refuse_placeholders(points_2d: FloatArray, where: str) -> None:
-    for value, here in _placeholders(points_2d, _SEVERAL):
+    for value, here in _placeholders(points_2d, _LEAST_PLACEHOLDERS):
         rows = np.flatnonzero(here)
         listed = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
         what = f"{len(rows)} keypoints, rows {listed}, are at exactly ({value:g}, {value:g})"
@@ -106,8 +106,8 @@ def _refuse_placeholders(points_2d: FloatArray, where: str) -> None:
 
 
 def _placeholders(points_2d: FloatArray, least: int) -> Iterator[tuple[float, BoolArray]]:
-    """Values of both coordinates that are written ``least`` times, and the rows (n,) of each."""
-    if len(points_2d) and points_2d.min() > 0:  # which is quickly told
+    """Placeholders that occur at least ``least`` times, each with a mask (n,) of its rows."""
+    if len(points_2d) and points_2d.min() > 0:  # a quick test
         return
     for value in _PLACEHOLDERS:
         here = (points_2d == value).all(axis=1)
@@ -116,16 +116,16 @@ def _placeholders(points_2d: FloatArray, least: int) -> Iterator[tuple[float, Bo
 
 
 def perspective(points_cam: FloatArray) -> FloatArray:
-    """Normalised image coordinates (n, 2) of points (n, 3); not finite at depth 0."""
+    """Normalised image coordinates (n, 2) of camera-frame points (n, 3); not finite at depth 0."""
     return points_cam[:, :2] / points_cam[:, 2:]
 
 
 # Lenses ------------------------------------------------------------------------------------------
 
 LensKind = Literal["perspective", "fisheye"]
-"""The kind of a lens, by the curve that its radius in the image follows."""
+"""Kind of a lens, by its radial projection."""
 
-# Numbers of coefficients that a lens of each kind may have, and how to give them.
+# Allowed numbers of coefficients by kind of lens, and the remedy for a message.
 _COEFFICIENTS = {
     "perspective": (
         (0, 4, 5, 8),
@@ -133,23 +133,24 @@ _COEFFICIENTS = {
     ),
     "fisheye": ((0, 4), "give (k1, k2, k3, k4)"),
 }
-_WITH_MORE = (12, 14)  # numbers of OpenCV's, with thin prism terms, and with the sensor's tilt
+_EXTENDED_COUNTS = (12, 14)  # OpenCV's, with thin prism terms, and with the sensor's tilt
 _NEWTON_STEPS = 50
-_TABLE = 257  # angles at which a fisheye's radius is tabulated
-_REAL = 1e-9  # imaginary part, relative, of a root that is real
-_MOST = 1e30  # coefficient that stands for larger ones; those below its inverse count as 0
+_TABLE = 257  # number of angles at which a fisheye's radius is tabulated
+_REAL = 1e-9  # relative imaginary part below which a root counts as real
+_MOST = 1e30  # bound on coefficients; smaller ones than its inverse count as 0
 
 
-def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    """The coefficients of a lens; none of a pinhole, and of a wide lens always all.
+def check_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    """Check and complete the coefficients of a lens.
 
-    Raises InputError if the kind is unknown, or has no such coefficients.
+    All-zero coefficients of a perspective lens become (), those missing of a fisheye become 0.
+    Raises InputError if the kind is unknown, or the coefficients don't fit it.
     """
     if not isinstance(kind, str) or kind not in _COEFFICIENTS:
         what, fix = f"{quote(kind)} is not a kind of lens", f"known are {', '.join(_COEFFICIENTS)}"
         raise InputError(what, where="camera.lens", fix=fix)
     counts, fix = _COEFFICIENTS[kind]
-    if kind == "perspective" and len(coefficients) in _WITH_MORE:
+    if kind == "perspective" and len(coefficients) in _EXTENDED_COUNTS:
         if any(coefficients[12:]):
             what = f"the sensor's tilt, {quote(coefficients[12:])}, is not modelled"
             fix = "calibrate without cv2.CALIB_TILTED_MODEL"
@@ -168,7 +169,7 @@ def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple
 
 
 def require_perspective_lens(kind: str, *, where: str) -> None:
-    """Refuse a wide lens whose focal length is unknown."""
+    """Raise an InputError for a wide lens, whose focal length must be known."""
     if kind != "perspective":
         fix = "calibrate the camera; only a perspective lens's focal length is estimated"
         raise InputError(f"the focal length of a {kind} lens is unknown", where=where, fix=fix)
@@ -176,7 +177,7 @@ def require_perspective_lens(kind: str, *, where: str) -> None:
 
 @lru_cache(maxsize=64)
 def _terms(kind: LensKind, coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    """Terms of a distortion: four radial n over three d, and two tangential p."""
+    """Terms of a distortion: radial numerator n1 to n4, denominator d1 to d3, tangential p1, p2."""
     if kind == "fisheye":
         return (*coefficients, *(0.0,) * 5)
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients + (0.0,) * (8 - len(coefficients))
@@ -185,10 +186,10 @@ def _terms(kind: LensKind, coefficients: tuple[float, ...]) -> tuple[float, ...]
 
 @lru_cache(maxsize=64)
 def largest_angle(coefficients: tuple[float, ...]) -> float:
-    """Angle off the axis [rad] up to which a fisheye maps outer directions farther out."""
+    """Angle off the axis [rad] up to which a fisheye's image radius increases with the angle."""
     n1, n2, n3, n4 = coefficients
     with np.errstate(over="ignore"):
-        # The slope of theta (1 + n1 theta^2 + n2 theta^4 + ...), by the square of theta.
+        # Derivative of theta (1 + n1 theta^2 + n2 theta^4 + ...), a polynomial in theta^2.
         slope = np.array([9 * n4, 7 * n3, 5 * n2, 3 * n1, 1.0]).clip(-_MOST, _MOST)
     slope[np.abs(slope) < 1 / _MOST] = 0.0
     roots = np.roots(slope)
@@ -199,14 +200,14 @@ def largest_angle(coefficients: tuple[float, ...]) -> float:
 def image_of(
     points: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Place (n, 2) of points (n, 3) in the image, and its derivatives (n, 2, 3) by the points."""
-    plane, by_point = _plane_of(points, kind)
+    """Image coordinates (n, 2) of points (n, 3), and their derivatives (n, 2, 3) by the points."""
+    plane, by_point = _project_undistorted(points, kind)
     distorted, by_plane = distort(plane, kind, coefficients)
     return distorted, by_plane @ by_point
 
 
-def _plane_of(points: FloatArray, kind: LensKind) -> tuple[FloatArray, FloatArray]:
-    """Place (n, 2) before distortion, and its derivatives (n, 2, 3)."""
+def _project_undistorted(points: FloatArray, kind: LensKind) -> tuple[FloatArray, FloatArray]:
+    """Image coordinates (n, 2) before distortion, and their derivatives (n, 2, 3)."""
     z = points[:, 2]
     if kind == "perspective":
         plane = perspective(points)
@@ -228,9 +229,9 @@ def _plane_of(points: FloatArray, kind: LensKind) -> tuple[FloatArray, FloatArra
 def rays_of_image(
     image: FloatArray, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Unit directions (n, 3) of places (n, 2) in the image of a fisheye, and where they exist.
+    """Unit directions (n, 3) of a fisheye's image coordinates (n, 2), and a mask of valid ones.
 
-    A table of the radial part gives the start of the search.
+    A table of the radial part gives the initial values of Newton's method.
     """
     radius = np.hypot(image[:, 0], image[:, 1])
     theta = np.interp(radius, *_radii(coefficients))
@@ -245,7 +246,7 @@ def rays_of_image(
 
 @lru_cache(maxsize=64)
 def _radii(coefficients: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Radii in a fisheye's image, and their angles [rad], both (`_TABLE`,)."""
+    """Tabulate a fisheye's image radii and their angles [rad], both (`_TABLE`,)."""
     n1, n2, n3, n4 = coefficients
     angles = np.linspace(0.0, largest_angle(coefficients), _TABLE)
     s = angles * angles
@@ -255,7 +256,7 @@ def _radii(coefficients: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
 def distort(
     normalized: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Distorted coordinates (n, 2) of undistorted ones (n, 2), and their derivatives (n, 2, 2)."""
+    """Distort image coordinates (n, 2); returns also the derivatives (n, 2, 2)."""
     n1, n2, n3, n4, d1, d2, d3, p1, p2 = _terms(kind, coefficients)
     x, y = normalized[:, 0], normalized[:, 1]
     r2 = x * x + y * y
@@ -283,7 +284,7 @@ def undistort(
     *,
     start: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray]:
-    """Invert `distort` by Newton's method from ``start`` (n, 2), and say where that succeeded."""
+    """Invert `distort` by Newton's method from ``start`` (n, 2); returns also a mask of success."""
     normalized = distorted.copy() if start is None else start
     active, errors = np.arange(len(distorted)), np.empty(len(distorted))
     for steps in range(_NEWTON_STEPS + 1):
@@ -292,7 +293,7 @@ def undistort(
         errors[active] = largest = np.abs(error).max(axis=1, initial=0.0)
         (a, b), (c, d) = jacobian.transpose(1, 2, 0)
         determinant = a * d - b * c
-        # Past the fold of the lens model the search would find a point that is not seen.
+        # Beyond the fold of the lens model, Newton's method would find points that are not seen.
         going = (largest >= 1e-14) & (determinant > 0) & np.isfinite(determinant)
         active, error = active[going], error[going]
         if not len(active) or steps == _NEWTON_STEPS:

@@ -1,4 +1,4 @@
-"""First hits of rays with a triangle mesh: embree finds the triangle, float64 the point."""
+"""Ray casting on triangle meshes: Embree finds the triangle, float64 arithmetic the point."""
 
 from __future__ import annotations
 
@@ -15,41 +15,40 @@ from cadalign.geometry.mesh import Mesh, face_normals
 FaceArray = npt.NDArray[np.int32]
 SingleArray = npt.NDArray[np.float32]
 
-# Embree counts in float32. Rays are perturbed by more than its rounding, so that a ray which passes
-# exactly through a shared edge does not slip between the two triangles (as 1 in 2,000 such rays
-# did, none with this). At a distance of 4 model radii that moves the hit by 1e-5 radii.
+# Embree uses float32. Directions are perturbed by more than its rounding error, so that a ray
+# exactly through a shared edge does not slip between the two triangles.
 _NUDGE = np.array([1.1e-6, 0.7e-6, -0.9e-6])
-# Farther than this from the mesh, in its radii, rays are started nearer by, or rounding shows.
+# Rays from farther away, in mesh radii, are started near the mesh to limit rounding errors.
 _FAR_ORIGIN = 8.0
-# Sine of the angle below which a triangle is seen so nearly edge-on that the intersection with its
-# plane is held to the triangle's own extent.
+# Sine of the angle between ray and triangle below which the intersection with the triangle's plane
+# is clipped to the triangle's extent.
 _GRAZING = 1e-3
 
 
 class EmbreeEngine:
-    """Embree by way of embreex, over vertices (n, 3) and faces (m, 3); safe in several threads."""
+    """Embree through embreex, for vertices (n, 3) and faces (m, 3); thread-safe."""
 
     def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, vertices, faces)
-        # Embree builds the hierarchy on the first query; let no two threads make that one at once.
+        # Embree builds the hierarchy on the first query, which is not thread-safe.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
     def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
-        """The first triangle on each of n rays (n, 3), (n,) int32; -1 where there is none."""
+        """First triangle on each ray (n, 3), (n,) int32; -1 without a hit."""
         found: FaceArray = self._scene.run(origins, directions)
         return found
 
     def blocked(
         self, origins: SingleArray, directions: SingleArray, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Rays that hit anything before ``origin + reach * direction``, (n,) bool."""
+        """Mask (n,) of rays that hit anything before ``origin + reach * direction``."""
         far = np.full(len(origins), reach, dtype=np.float32)
         return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
 
 
 class Open3DEngine:
-    """Embree by way of Open3D, which casts with all cores by itself; see `EmbreeEngine`."""
+    """Embree through Open3D, which uses all cores; see `EmbreeEngine`."""
 
     def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
         import open3d
@@ -61,7 +60,7 @@ class Open3DEngine:
             self._tensor(np.ascontiguousarray(vertices)),
             self._tensor(np.ascontiguousarray(faces.astype(np.uint32))),
         )
-        # The hierarchy is built on the first query; let no two threads make that one at once.
+        # The hierarchy is built on the first query, which is not thread-safe.
         self.first_faces(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
     def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
@@ -81,9 +80,9 @@ class Open3DEngine:
 
 
 class RayCaster:
-    """A bounding volume hierarchy over a mesh, then only read; safe in several threads.
+    """Ray caster on a mesh, with an immutable bounding volume hierarchy; thread-safe.
 
-    ``normals`` (m, 3) are the unit normals of its faces, where they are known already.
+    ``normals`` (m, 3) are the faces' unit normals, computed if not given.
     """
 
     def __init__(
@@ -95,7 +94,7 @@ class RayCaster:
     ) -> None:
         low, high = self.bounds = mesh.bounds
         self._center = (low + high) / 2
-        # A mesh of a single point has no size; any radius serves.
+        # A mesh of a single point has radius 0, which cannot be divided by.
         self._radius = float(np.linalg.norm(high - low)) / 2 or 1.0
         self._triangles = mesh.triangles
         self._normals = face_normals(self._triangles) if normals is None else normals
@@ -107,8 +106,8 @@ class RayCaster:
     ) -> tuple[FaceArray, FloatArray]:
         """Find the first triangle on each ray (n, 3) from one point, beyond ``start`` (n,).
 
-        Its number is -1 and its distance infinite where there is none; ``start`` and distances,
-        both (n,), count in the directions' own lengths.
+        Returns triangle numbers (n,), -1 without a hit, and distances (n,), infinite without a hit.
+        ``start`` and distances are in units of each direction's length.
         """
         face = self._engine.first_faces(*self._rays(origin, directions, start))
         return face, self._distances(origin, directions, face)
@@ -118,15 +117,15 @@ class RayCaster:
         return self._normals[face]
 
     def covered(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
-        """Find the rays (n, 3) from one point that hit anything, (n,) bool."""
+        """Mask (n,) of rays (n, 3) from one point that hit anything."""
         return self._engine.blocked(*self._rays(origin, directions), np.inf)
 
     def blocked(
         self, origins: FloatArray, directions: FloatArray, *, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Find the rays (n, 3) that hit anything on their way, (n,) bool; to single precision.
+        """Mask (n,) of rays (n, 3) that hit anything within ``reach`` times their direction.
 
-        Each ray goes ``reach`` times its direction's length, in model coordinates.
+        Computed in single precision.
         """
         unit = (origins - self._center) / self._radius
         return self._engine.blocked(
@@ -136,7 +135,7 @@ class RayCaster:
     def _rays(
         self, origin: FloatArray, directions: FloatArray, start: FloatArray | None = None
     ) -> tuple[SingleArray, SingleArray]:
-        """Origins and directions (n, 3) of rays for the engine, in units of the mesh's radius."""
+        """Origins and directions (n, 3) for the engine, in units of the mesh's radius."""
         origin = (origin - self._center) / self._radius
         length = np.sqrt(np.einsum("nk,nk->n", directions, directions))
         unit = directions / length[:, None]
@@ -153,7 +152,7 @@ class RayCaster:
         return origins.astype(np.float32, copy=False), unit.astype(np.float32)
 
     def _distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
-        """Distances of `first_hits`, in double precision."""
+        """Distances (n,) of `first_hits`, in double precision."""
         distance = np.full(len(face), np.inf)
         hit = np.flatnonzero(face >= 0)
         found, along = face[hit], directions[hit]

@@ -1,4 +1,4 @@
-"""Rotation matrices from and to rotation vectors and quaternions."""
+"""Rotation matrices, rotation vectors and quaternions."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ _LAST_ROW = 1e-6
 
 
 def dots(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Dot products (...) of vectors (..., k), those of BLAS bit for bit."""
+    """Dot products (...) of vectors (..., k), equal to BLAS bit for bit."""
     return np.asarray(np.matmul(first[..., None, :], second[..., :, None])[..., 0, 0])
 
 
 def lengths(vectors: FloatArray) -> FloatArray:
-    """Euclidean lengths (...) of vectors (..., k), those of `numpy.linalg.norm` bit for bit."""
+    """Euclidean lengths (...) of vectors (..., k), equal to `numpy.linalg.norm` bit for bit."""
     return np.sqrt(dots(vectors, vectors))
 
 
 def rotation_from_vector(vector: FloatArray) -> FloatArray:
-    """The rotation matrix (3, 3) of a rotation vector (3,), axis times angle [rad]: Rodrigues."""
+    """Convert a rotation vector (3,), axis times angle [rad], to a matrix (3, 3) (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle == 0:
         return np.eye(3)
     x, y, z = np.asarray(vector) / angle
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    # 1 - cos written with the half angle keeps its digits where the angle is small.
+    # The half angle avoids cancellation in 1 - cos at small angles.
     square = 2 * math.sin(angle / 2) ** 2 * (cross @ cross)
     return np.asarray(np.eye(3) + math.sin(angle) * cross + square)
 
 
 def by_rotation(points: FloatArray) -> FloatArray:
-    """Derivatives (..., 3, 3) of points (..., 3) by a rotation vector: columns are axis x point."""
+    """Derivatives (..., 3, 3) of points (..., 3) by a rotation vector; columns are axis x point."""
     x, y, z = np.moveaxis(points, -1, 0)
-    found = np.zeros((*points.shape, 3))  # np.cross takes several times as long
+    found = np.zeros((*points.shape, 3))  # np.cross is several times slower
     found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = z, -y, x
     found[..., 1, 0], found[..., 2, 0], found[..., 2, 1] = -z, y, -x
     return found
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
-    """The rotation vector (3,), axis times angle [rad], of a rotation matrix (3, 3)."""
+    """Convert a rotation matrix (3, 3) to a rotation vector (3,), axis times angle [rad]."""
     w, x, y, z = _quaternion(rotation)
     sine = math.sqrt(x * x + y * y + z * z)
     factor = 2.0 * math.atan2(sine, w) / sine if sine > 0 else 2.0
@@ -55,11 +55,11 @@ def vector_from_rotation(rotation: FloatArray) -> FloatArray:
 
 
 def _quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """The unit quaternion w, x, y, z of a rotation matrix (3, 3), with w not negative.
+    """Convert a rotation matrix (3, 3) to a unit quaternion w, x, y, z with w >= 0.
 
-    Each of its components in turn is the square root of a sum of the diagonal; the largest one
-    determines the others (Shepperd, "Quaternion from rotation matrix", 1978). SciPy's conversion
-    takes ten times as long for a single matrix.
+    The largest component is computed from the diagonal and determines the others (Shepperd,
+    "Quaternion from rotation matrix", 1978). SciPy's conversion of a single matrix is ten times
+    slower.
     """
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
@@ -76,10 +76,10 @@ def _quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
 
 
 def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Angles (...) of rotations from matrices (..., 3, 3) to others [degrees], 0 to 180.
+    """Angles (...) between rotation matrices (..., 3, 3) [degrees], 0 to 180.
 
-    From the chord, |first - second| = sqrt(8) sin(angle / 2), which is exact at small angles, where
-    the usual arc cosine of the trace loses half the digits (and beyond 90 degrees from the trace).
+    The chord |first - second| = sqrt(8) sin(angle / 2) is accurate at small angles, where the arc
+    cosine of the trace loses half the digits. The trace gives the cosine of half the angle.
     """
     difference = first - second
     chord = lengths(difference.reshape(*difference.shape[:-2], 9)) / np.sqrt(8.0)
@@ -88,15 +88,13 @@ def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def nearest_rotation(matrix: FloatArray, *, where: str = "rotation") -> FloatArray:
-    """The rotation nearest to a matrix (3, 3) that is one but for few digits or a worn calibration.
-
-    Rotations of LINEMOD-Occluded are up to 1.3e-3 off.
+    """Rotation nearest to a matrix (3, 3) that is a rotation up to 1e-2.
 
     Raises
     ------
     InputError
         If an entry of ``matrix @ matrix.T`` is more than 1e-2 off the identity, or the matrix is a
-        reflection; ``where`` names it.
+        reflection. ``where`` is the matrix's name in the message.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(matrix @ matrix.T - np.eye(3)).max()
@@ -110,12 +108,12 @@ def nearest_rotation(matrix: FloatArray, *, where: str = "rotation") -> FloatArr
 
 
 def nearest_rigid(matrix: npt.ArrayLike, *, where: str) -> FloatArray:
-    """The rigid motion (4, 4) nearest to a matrix; see `nearest_rotation`.
+    """Rigid motion (4, 4) nearest to a matrix; see `nearest_rotation`.
 
     Raises
     ------
     InputError
-        If it is none, or its last row is not 0, 0, 0, 1; ``where`` names it.
+        If the matrix is not a rigid motion, or its last row is not 0, 0, 0, 1.
     """
     motion = as_floats(matrix, name=where, shape=(4, 4)).copy()
     try:
@@ -130,15 +128,15 @@ def nearest_rigid(matrix: npt.ArrayLike, *, where: str) -> FloatArray:
 
 
 def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
-    """The rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
+    """Convert a quaternion (4,), scalar first and of any length, to a rotation matrix (3, 3).
 
-    Raises InputError if it is zero or not finite.
+    Raises InputError if the quaternion is zero or not finite.
     """
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quat_wxyz)
     if not (np.isfinite(length) and length > 0):
         raise InputError(f"{quat_wxyz.tolist()} is not a rotation", where="quaternion")
-    # Written out, since runs are told apart by the bits of the poses they were given.
+    # Not by SciPy: runs are identified by the exact bits of their poses.
     w, x, y, z = quat_wxyz / length
     return np.array(
         [
@@ -150,16 +148,16 @@ def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
 
 
 def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
-    """The quaternion (4,) of a rotation matrix (3, 3), scalar first and not negative."""
+    """Convert a rotation matrix (3, 3) to a quaternion (4,), scalar first and >= 0."""
     return np.array(_quaternion(np.asarray(rotation)))
 
 
 def spread_rotations(count: int) -> FloatArray:
-    """Rotations (count, 3, 3) spread evenly.
+    """Evenly spread rotations (count, 3, 3).
 
     Alexa, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
     """
-    from scipy.spatial.transform import Rotation  # takes longer to import than all that is here
+    from scipy.spatial.transform import Rotation  # slow to import
 
     psi = 1.533751168755204288118041
     place = np.arange(count) + 0.5

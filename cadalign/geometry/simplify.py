@@ -1,4 +1,4 @@
-"""Edges of triangle meshes, and fewer triangles by clustering."""
+"""Edges of triangle meshes, and simplification by vertex clustering."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.geometry.mesh import Mesh, face_normals
 
 FINEST = float(1 << 20)
-"""The largest number of cells along an axis, so that a cell's number fits into 63 bits."""
+"""Largest number of cells along an axis: a cell's number must fit into 63 bits."""
 
 _CELL_NUMBER = np.array([1 << 42, 1 << 21, 1])
-_FACES_PER_CELL = 9.4  # over the number of cells along an axis, squared: a sphere's
+_FACES_PER_CELL = 9.4  # faces of a sphere over the squared number of cells along an axis
 _MOST_TRIES = 6
 
 
@@ -22,9 +22,9 @@ _MOST_TRIES = 6
 class MeshEdges:
     """The edges of a triangle mesh.
 
-    ``ends`` (e, 2) are vertices, the lower number first; ``opposite`` (e, 2) the third vertices of
-    two triangles at the edge, the same one twice at a border. ``creased`` (e,) are borders, edges
-    of more than two triangles, and edges at which the surface bends.
+    ``ends`` (e, 2) are vertex numbers, the lower one first. ``opposite`` (e, 2) are the third
+    vertices of the two triangles at the edge, the same vertex twice at a border. ``creased`` (e,)
+    marks borders, edges of more than two triangles, and edges at which the surface bends.
     """
 
     ends: IntArray
@@ -33,9 +33,9 @@ class MeshEdges:
 
 
 def mesh_edges(vertices: FloatArray, faces: IntArray, *, crease_angle: float) -> MeshEdges:
-    """Find the edges of a mesh whose triangles, sharing vertices, may face either way.
+    """Find the edges of a mesh; its triangles may have either orientation.
 
-    Triangles whose planes meet at a larger angle than ``crease_angle`` [degrees] make a crease.
+    An edge is creased if its triangles' planes meet at more than ``crease_angle`` [degrees].
     """
     sides = triangle_sides(faces)
     key = sides @ [len(vertices), 1]
@@ -50,23 +50,23 @@ def mesh_edges(vertices: FloatArray, faces: IntArray, *, crease_angle: float) ->
 
 
 def triangle_sides(faces: IntArray) -> IntArray:
-    """The sides of triangles, (3 m, 2) int, three after each other, the lower vertex first."""
+    """Sides of triangles (m, 3), three rows for each, (3 m, 2) int; the lower vertex first."""
     return np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
 
 
 def number_rows(rows: npt.NDArray[np.float64] | npt.NDArray[np.int64]) -> IntArray:
     """Number the distinct rows of an (n, 3) array; (n,) int, equal for equal rows."""
-    # Adding 0 turns -0.0 into 0.0, which has other bytes.
+    # Adding 0 turns -0.0 into 0.0; their bytes differ.
     packed = np.ascontiguousarray(rows + 0).view(np.dtype((np.void, 3 * rows.itemsize))).ravel()
     return np.asarray(np.unique(packed, return_inverse=True)[1].ravel(), dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
-    """A mesh with fewer triangles.
+    """A simplified mesh.
 
-    ``source`` (m,) has, for each triangle, one of the full mesh that it replaces. ``wires`` (k, 2)
-    are lines left of parts too thin for triangles: no triangle has these as a side.
+    ``source`` (m,) is the number of a triangle of the full mesh that each triangle replaces.
+    ``wires`` (k, 2) are lines that remain of thin parts; they are not sides of triangles.
     """
 
     vertices: FloatArray
@@ -76,12 +76,12 @@ class Simplified:
 
 
 def cluster(mesh: Mesh, *, cells: float) -> Simplified:
-    """Merge the vertices in each cell of a grid into their mean; drop what has lost its area.
+    """Simplify a mesh: merge the vertices in each cell of a grid into their mean.
 
-    As in Rossignac, Borrel, "Multi-resolution 3D approximations for rendering complex scenes"
-    (1993). The first of triangles in one place remains. A triangle that becomes a line remains as a
-    wire, so that masts and railings don't vanish. ``cells``, at most `FINEST`, are those along the
-    longest side of the mesh.
+    See Rossignac, Borrel, "Multi-resolution 3D approximations for rendering complex scenes" (1993).
+    Of coincident triangles the first is kept. Triangles that become lines are kept as wires, so
+    that masts and railings don't vanish; those that become points are dropped. ``cells``, at most
+    `FINEST`, is the number of cells along the longest side of the mesh.
     """
     used = mesh.is_used
     vertices = mesh.vertices[used]
@@ -97,7 +97,7 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
     kept = np.flatnonzero(solid)
     _, first = np.unique(number_rows(ordered[kept]), return_index=True)
     kept = kept[np.sort(first)]
-    # Pairs of vertices as one number each.
+    # Encode each pair of vertices as one number.
     thin = np.unique(ordered[~solid][:, [0, 2]] @ [len(number), 1])
     thin = thin[thin // len(number) != thin % len(number)]
     thin = thin[~np.isin(thin, triangle_sides(faces[kept]) @ [len(number), 1])]
@@ -109,10 +109,10 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
 
 
 def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
-    """Cluster a mesh to at most so many triangles; unchanged if it has no more.
+    """Simplify a mesh to at most ``max_faces`` triangles by `cluster`.
 
-    The grid is made coarser or finer until about as many triangles are left as may be. If none has
-    a fitting number, the first triangles of the mesh remain.
+    The grid's resolution is adapted until the number of triangles is near the maximum. If no grid
+    satisfies the maximum, the first ``max_faces`` triangles of the mesh are returned.
     """
     if len(mesh.faces) <= max_faces:
         return Simplified(mesh.vertices, mesh.faces, np.arange(len(mesh.faces)))
@@ -125,7 +125,7 @@ def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
             best, most = result, count
         if 0.6 * max_faces < count <= max_faces:
             break
-        # The number of triangles goes with the square of the number of cells.
+        # The number of triangles is proportional to the squared number of cells.
         cells *= np.sqrt(0.8 * max_faces / max(count, 1))
     if best is not None:
         return best

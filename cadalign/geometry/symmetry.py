@@ -1,16 +1,16 @@
-"""Symmetries of models: the rotations that take one to itself, and the alignments that are equal.
+"""Symmetries of models: rotations that map a model to itself, and equivalent alignments.
 
-A motion g of the group takes the model to itself, so the alignments A and A g place the same
-object. With A's rotation R and stretch S, A g has the linear part R S G. That is again a rotation
-and a stretch along the model's axes where G' S^2 G is diagonal: then its rotation is R' = R G and
-its stretch S' = G' S G. Two cases:
+A motion g of the group maps the model to itself, so the alignments A and A g place the same object.
+With A's rotation R and stretch S, and g's rotation G, A g has the linear part R S G. That is again
+a rotation and a stretch along the model's axes if G' S^2 G is diagonal: its rotation is then
+R' = R G and its stretch S' = G' S G. Two cases:
 
-- G S = S G: the stretch keeps the symmetry, S' = S. For a quarter turn about y this needs equal
-  stretches along x and z, for a half turn about y nothing. Among the rotations by any angle about
-  an axis only half turns are left where the stretches across it differ.
-- G exchanges two of the model's axes that are stretched differently, as a quarter turn does: S' has
-  their stretches exchanged. The same object, with its sides named the other way round. Where one of
-  these stretches is held, as that along x is by one image, A g is no answer and is left out.
+- G S = S G: the stretch keeps the symmetry, S' = S. A quarter turn about y needs equal stretches
+  along x and z; a half turn about y needs nothing. Of the rotations by any angle about an axis,
+  only half turns remain if the stretches across the axis differ.
+- G exchanges two of the model's axes with different stretches, as a quarter turn does: S' has these
+  stretches exchanged. If one of the two is held (one image holds the stretch along x), A g is not
+  allowed.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from cadalign.geometry.rotations import angles_between, nearest_rotation, rotati
 
 _QUARTERS = [rotation_from_vector(np.pi / 2 * axis).round() for axis in np.eye(3)]
 FACING = np.diag(OPENGL_AXES)
-"""Rotation of a model that stands upright, y up, and faces the camera with its z axis."""
+"""Rotation of an upright model, y up, whose z axis points to the camera."""
 LIKE_FACING = tuple(FACING @ quarter for quarter in _QUARTERS)
-"""Rotations to compare with where `FACING` is as far from all."""
+"""References that break ties between rotations equally far from `FACING`."""
 _MOST_ROTATIONS = 240
-_SAME_DEG = 1.0  # rotations at a smaller angle are one, given with few digits
+_SAME_DEG = 1.0  # rotations closer than this are the same, given with few digits
 _PARALLEL = 1e-3
 _TIE = 1e-6
-# Angles between axes that a stretched model may exchange, and those of half turns.
+# Angles between axes that a stretched model may exchange, and angles of half turns.
 _ANGLES = np.pi / 6 * np.arange(12)
 _FIELDS = ("center", "rotations", "axes")
 _FORMS = f"give an `axis` with `fold` (null for any angle), or {', '.join(_FIELDS)}"
@@ -45,41 +45,41 @@ _FORMS = f"give an `axis` with `fold` (null for any angle), or {', '.join(_FIELD
 
 @dataclass(frozen=True, eq=False)
 class Equal:
-    """An alignment that places the model as another one does: ``other @ motion``."""
+    """An alignment equivalent to another one: ``other @ motion``."""
 
     alignment: Alignment
     motion: FloatArray
-    """The symmetry (4, 4) that leads to it; it takes the model to itself."""
+    """The symmetry (4, 4), a motion that maps the model to itself."""
     free: FloatArray
-    """Directions (k, 3) in the model's frame of axes about which any rotation is equal as well."""
+    """Axes (k, 3) in the model's frame about which any rotation gives an equivalent alignment."""
     center: FloatArray
-    """A point (3,) of the model that all symmetries keep."""
+    """Fixed point (3,) of all symmetries, in the model's frame."""
 
     def relabelled(self, points: FloatArray) -> FloatArray:
-        """Model points (n, 3) of the other alignment where this one has them; (n, 3) float."""
+        """Model points (n, 3) of the other alignment in this alignment's model frame; (n, 3)."""
         return np.asarray((points - self.motion[:3, 3]) @ self.motion[:3, :3])
 
 
-# A rotation P, with the axes (k, 3) of all rotations Rot(axis, angle) P; three are any rotation.
+# A rotation P and axes (k, 3): all rotations Rot(axis, angle) P. Three axes: any rotation.
 _Branch = tuple[FloatArray, FloatArray]
 _NO_AXES = np.empty((0, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """The rotations about one point that take a model to itself.
+    """Rotations about one point that map a model to itself.
 
-    Given are any rotations and axes; kept is the group that they generate.
+    The given rotations and axes are completed to the group that they generate.
 
     Raises
     ------
     InputError
-        If a shape is wrong, a matrix is no rotation, an axis is zero, or there are more than 240
+        If a shape is wrong, a matrix is not a rotation, an axis is zero, or there are more than 240
         rotations.
 
     Examples
     --------
-    A quarter turn makes a group of four:
+    A quarter turn generates a group of four rotations:
 
     >>> quarter = Symmetry.around((0, 1, 0), fold=4).rotations[1:2]
     >>> len(Symmetry(np.zeros(3), quarter).rotations), Symmetry.none().is_trivial
@@ -87,13 +87,13 @@ class Symmetry:
     """
 
     center: FloatArray
-    """The point (3,) [model units]."""
+    """Fixed point (3,) of the rotations [model units]."""
     rotations: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
-    """The rotations (g, 3, 3), the identity first; with an axis, one of those that only differ by a
-    rotation about it; of a ball, the identity alone."""
+    """Rotations (g, 3, 3), the identity first. With one axis: representatives, up to rotations
+    about it. With three axes: the identity alone."""
     axes: FloatArray = field(default_factory=lambda: _NO_AXES)
-    """Unit vectors (k, 3) of axes about which any rotation belongs to the group: none, one, or the
-    three of a ball, to which any rotation belongs."""
+    """Unit vectors (k, 3) of axes about which any rotation belongs to the group: none, one, or
+    three for a sphere (any rotation)."""
 
     def __post_init__(self) -> None:
         center = as_floats(self.center, name="symmetry.center", shape=(3,))
@@ -102,30 +102,31 @@ class Symmetry:
         where = "symmetry.rotations[{}]"
         rotations = [nearest_rotation(each, where=where.format(k)) for k, each in enumerate(given)]
         directions = np.reshape([_direction(axis, "symmetry.axes") for axis in axes], (-1, 3))
-        group = _group_of(rotations, directions)
+        group = _generate_group(rotations, directions)
         for name, value in zip(_FIELDS, (center, *group), strict=True):
             object.__setattr__(self, name, read_only(value))
 
     @classmethod
     def none(cls) -> Symmetry:
-        """The symmetry of a model that no rotation takes to itself."""
+        """Make the symmetry of a model without symmetries."""
         return cls(np.zeros(3))
 
     @classmethod
     def around(
         cls, direction: npt.ArrayLike, *, fold: int | None, offset: npt.ArrayLike = (0, 0, 0)
     ) -> Symmetry:
-        """Rotations about one axis: ``fold`` of them, by equal angles, or any where it is None.
+        """Make a rotational symmetry about one axis.
 
-        The axis has a ``direction`` (3,) of any length, and the point ``offset`` (3,) on it.
+        ``fold`` is the number of rotations, by equal angles, or None for any angle. The axis has
+        the ``direction`` (3,), of any length, and passes through ``offset`` (3,).
 
         Raises
         ------
         InputError
-            If ``fold`` is no whole number from 1 to 240, or the axis is none.
+            If ``fold`` is not a whole number from 1 to 240, or the direction is zero.
         """
         if fold is not None and not (is_whole(fold) and 0 < fold <= _MOST_ROTATIONS):
-            what = f"{quote(str(fold))} is no number of rotations"
+            what = f"{quote(str(fold))} is not a number of rotations"
             fix = f"give 1 to {_MOST_ROTATIONS}, or None (null in a file) for any angle"
             raise InputError(what, where="symmetry.fold", fix=fix)
         axis = _direction(as_floats(direction, name="symmetry.axis", shape=(3,)), "symmetry.axis")
@@ -137,18 +138,18 @@ class Symmetry:
 
     @classmethod
     def from_dict(cls, data: object) -> Symmetry:
-        """Read a symmetry as observation files write it.
+        """Read a symmetry in the form of observation files or of `to_dict`.
 
         Parameters
         ----------
         data : mapping
             ``{"axis": (3,), "fold": int or None}`` with an optional ``offset``, see `around`; or
-            the fields of the class, as `to_dict` writes them.
+            the fields of the class, see `to_dict`.
 
         Raises
         ------
         InputError
-            If it is in no such form, or a value is invalid.
+            If the form or a value is invalid.
 
         Examples
         --------
@@ -163,18 +164,18 @@ class Symmetry:
             offset = data.get("offset", (0.0, 0.0, 0.0))
             return cls.around(data["axis"], fold=data["fold"], offset=offset)
         if names != set(_FIELDS):
-            what = f"the fields {', '.join(sorted(map(str, names)))} are no symmetry's"
+            what = f"the fields {', '.join(sorted(map(str, names)))} are not a symmetry"
             raise InputError(what, where="symmetry", fix=_FORMS)
         center, rotations, axes = (data[name] for name in _FIELDS)
         return cls(center, rotations, _NO_AXES if isinstance(axes, list) and not axes else axes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Write the symmetry as plain lists, for JSON."""
+        """Convert to a dict of lists, for JSON."""
         return {name: getattr(self, name).tolist() for name in _FIELDS}
 
     @property
     def is_trivial(self) -> bool:
-        """True if there is no rotation but the identity."""
+        """True if the identity is the only rotation."""
         return not len(self.axes) and len(self.rotations) == 1
 
     def __str__(self) -> str:
@@ -190,17 +191,17 @@ class Symmetry:
         reference: FloatArray | None = None,
         tolerance: float = 1e-4,
     ) -> Equal:
-        """The one of all equal alignments whose rotation is nearest to a reference.
+        """Find the equivalent alignment whose rotation is nearest to a reference.
 
-        The same for all equal alignments, and itself the canonical one of its own. The scales of
-        ``held`` axes must stay as they are. The reference (3, 3) is by default `FACING`: the model
-        upright, y up, its z axis towards the camera; where several are as near, the entries of the
-        rotation decide. Scales that differ by up to ``tolerance`` count as equal.
+        All equivalent alignments have the same canonical one. The scales of ``held`` axes do not
+        change. The reference (3, 3) is by default `FACING`: the model upright, y up, its z axis
+        towards the camera. Ties are broken by `LIKE_FACING`, then by the rotation's entries. Scales
+        that differ by up to ``tolerance`` count as equal.
         """
         references = (FACING, *LIKE_FACING) if reference is None else (reference, *LIKE_FACING)
         found = [
             (_nearest(alignment, branch, references), scale, branch)
-            for branch, scale in self._kept(alignment.scale, held, tolerance)
+            for branch, scale in self._allowed_branches(alignment.scale, held, tolerance)
         ]
         best = max(found, key=lambda each: _rank(alignment.rotation @ each[0], references))
         rotation, scale, (turn, axes) = best
@@ -215,10 +216,11 @@ class Symmetry:
         return Equal(result, motion, free, self.center)
 
     def nearest_turned(self, alignment: Alignment, rotation: FloatArray) -> Alignment:
-        """The alignment nearest to a rotation of all that the group makes of the placed object.
+        """Apply the group to the stretched object; return the alignment nearest to ``rotation``.
 
-        These motions take the stretched object to itself, not the model: x -> R (c + G (S x - c)) +
-        t with the alignment's R, S, t. That is an alignment of the rotation R G and the same scale.
+        Unlike `canonical`, this assumes that the stretched object has the symmetry, not the model:
+        x -> R (c + G (S x - c)) + t with the alignment's R, S, t. The result has the rotation R G
+        and the same scale.
         """
         if self.is_trivial:
             return alignment
@@ -229,10 +231,10 @@ class Symmetry:
         turned = alignment.rotation @ best
         return Alignment(turned, alignment.translation + shift, alignment.scale, is_valid=True)
 
-    def _kept(
+    def _allowed_branches(
         self, scale: FloatArray, held: tuple[bool, bool, bool], tolerance: float
     ) -> Iterator[tuple[_Branch, FloatArray]]:
-        """Rotations of the group that lead to an alignment, and its scale."""
+        """Rotations of the group that give an allowed alignment, with its scale."""
         fixed = np.array(held)
         for branch in self._branches(scale, tolerance):
             turned = (branch[0].T * scale**2) @ branch[0]
@@ -247,7 +249,7 @@ class Symmetry:
     def _branches(self, scale: FloatArray, tolerance: float) -> list[_Branch]:
         if len(self.axes) == 3:
             return _free_branches(scale, tolerance)
-        if not len(self.axes) or _keeps_turns(self.axes[0], scale, tolerance):
+        if not len(self.axes) or _is_round(self.axes[0], scale, tolerance):
             return [(rotation, self.axes) for rotation in self.rotations]
         turns = [rotation_from_vector(angle * self.axes[0]) for angle in _ANGLES]
         return [(turn @ each, _NO_AXES) for each, turn in product(self.rotations, turns)]
@@ -261,8 +263,8 @@ def _direction(axis: FloatArray, where: str) -> FloatArray:
     return np.asarray(axis / length)
 
 
-def _group_of(rotations: list[FloatArray], axes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations (g, 3, 3) and axes (k, 3) of the group that some generate; see `Symmetry`."""
+def _generate_group(rotations: list[FloatArray], axes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotations (g, 3, 3) and axes (k, 3) of the generated group; see `Symmetry`."""
     identity = np.eye(3)
     if not len(axes):
         return _closure(rotations), axes
@@ -280,7 +282,7 @@ def _group_of(rotations: list[FloatArray], axes: FloatArray) -> tuple[FloatArray
 def _nearest(
     alignment: Alignment, branch: _Branch, references: tuple[FloatArray, ...]
 ) -> FloatArray:
-    """The rotation of a branch that brings the alignment nearest to the first reference.
+    """The rotation of a branch that brings the alignment's rotation nearest to the reference.
 
     With N = P T' R the trace of T' R Rot(a, angle) P is A cos(angle) + B sin(angle) + a'N a
     with A = tr N - a'N a, B = -a . vee(N - N').
@@ -303,7 +305,7 @@ def _nearest(
 
 
 def _rank(rotation: FloatArray, references: tuple[FloatArray, ...]) -> tuple[float, ...]:
-    """Closeness to the references and, as there may be ties, the entries; rounded."""
+    """Sort key of a rotation: closeness to each reference, then its entries; rounded."""
     entries = rotation.ravel()
     values = np.concatenate([np.array(references).reshape(-1, 9) @ entries, entries])
     return tuple((values / _TIE).round().tolist())
@@ -318,15 +320,15 @@ def _closure(generators: list[FloatArray]) -> FloatArray:
             if angles_between(np.array(found), product_of_both).min() < _SAME_DEG:
                 continue
             if len(found) == _MOST_ROTATIONS:
-                what = f"its motions make more than {_MOST_ROTATIONS} rotations"
-                fix = "give an axis where any rotation about it takes the model to itself"
+                what = f"generates more than {_MOST_ROTATIONS} rotations"
+                fix = "give an axis if any rotation about it takes the model to itself"
                 raise InputError(what, where="symmetry", fix=fix)
             found.append(product_of_both)
     return np.array(found)
 
 
-def _keeps_turns(axis: FloatArray, scale: FloatArray, tolerance: float) -> bool:
-    """True if the stretch is the same in all directions across an axis, and along or across it."""
+def _is_round(axis: FloatArray, scale: FloatArray, tolerance: float) -> bool:
+    """True if a stretch is rotationally symmetric about an axis."""
     squares = np.diag(scale**2)
     along = float(axis @ squares @ axis)
     across = (float(np.trace(squares)) - along) / 2
@@ -335,11 +337,11 @@ def _keeps_turns(axis: FloatArray, scale: FloatArray, tolerance: float) -> bool:
 
 
 def _free_branches(scale: FloatArray, tolerance: float) -> list[_Branch]:
-    """Rotations of a sphere that a stretch keeps."""
+    """Rotations that map a stretched sphere to itself."""
     same: BoolArray = np.abs(scale[:, None] - scale) <= tolerance * scale
     if same.all():
         return [(np.eye(3), np.eye(3))]
-    signed = _closure(_QUARTERS)  # axes go to axes
+    signed = _closure(_QUARTERS)  # permutations of the axes with signs
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
         if same[first, second]:

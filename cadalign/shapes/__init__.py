@@ -1,4 +1,4 @@
-"""Knowledge of a category: learned shape models, and the deformation of meshes."""
+"""Shape models of categories, and deformation of meshes."""
 
 from typing import TYPE_CHECKING
 

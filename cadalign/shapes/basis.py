@@ -1,4 +1,4 @@
-"""Shape components from given means, modes and covariances, and the mirror of a category."""
+"""Shape components from means, modes and covariances, and mirror symmetry of a category."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import extent
-from cadalign.shapes.parts import BOX_ROWS, ShapeComponent, checked_box
+from cadalign.shapes.parts import BOX_ROWS, ShapeComponent, check_box
 
-_ROUNDS = 10  # of pairing keypoints and moving the mirror; 3 suffice as a rule
+_ROUNDS = 10  # most iterations of pairing keypoints and moving the mirror; usually 3
 
 
 def component_of_basis(
@@ -31,19 +31,19 @@ def component_of_basis(
     sigmas = as_floats(deviations, name="deviations", shape=(len(directions),))
     if (sigmas < 0).any():
         raise InputError(f"{sigmas.min():g} is negative", where="deviations")
-    rows = np.vstack([points, extent(points) if box is None else checked_box(box, "box")])
+    rows = np.vstack([points, extent(points) if box is None else check_box(box, "box")])
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
-    return ShapeComponent(1.0, rows, _orthogonal(np.array(extended), len(rows)), residual_sigma)
+    return ShapeComponent(1.0, rows, _orthogonalise(np.array(extended), len(rows)), residual_sigma)
 
 
 def component_of_covariance(
     mean: FloatArray, covariance: FloatArray, *, weight: float = 1.0, modes: int | None = None
 ) -> ShapeComponent:
-    """Make a component from a covariance: its largest eigenvectors are the modes.
+    """Make a component whose modes are the main eigenvectors of a covariance.
 
-    ``mean`` is (m + 2, 3), ``covariance`` (3 (m + 2), 3 (m + 2)); by default all modes of positive
-    variance are taken. The variance that they leave is spread evenly over the coordinates.
+    ``mean`` is (m + 2, 3), ``covariance`` (3 (m + 2), 3 (m + 2)). By default all modes of positive
+    variance are used. The residual has the mean variance of the others, as in probabilistic PCA.
     """
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
@@ -52,14 +52,14 @@ def component_of_covariance(
     directions = (vectors[:, :count] * np.sqrt(values[:count])).T.reshape(count, *mean.shape)
     rest = values[count:]
     sigma = float(np.sqrt(rest.mean())) if len(rest) else 0.0
-    if sigma:  # the residual is part of every direction, also of the modes'
+    if sigma:  # the residual also has a variance along the modes
         kept = np.sqrt(np.maximum(1 - sigma**2 / values[:count], 0.0))
         directions = directions * kept.reshape(-1, 1, 1)
     return ShapeComponent(weight, mean, directions, sigma)
 
 
 def _corners(points: FloatArray, mode: FloatArray, corners: FloatArray) -> FloatArray:
-    """Motion of the box's corners: the shift and stretch along each axis that fit the mode best."""
+    """Motion (2, 3) of the box's corners by the shift and axis stretch that fit a mode best."""
     centre = points.mean(axis=0)
     offsets = points - centre
     squares = (offsets**2).sum(axis=0)
@@ -67,8 +67,8 @@ def _corners(points: FloatArray, mode: FloatArray, corners: FloatArray) -> Float
     return np.asarray(mode.mean(axis=0) + stretch * (corners - centre))
 
 
-def _orthogonal(modes: FloatArray, count: int) -> FloatArray:
-    """Modes (K, count, 3) of the same covariance that are orthogonal, the longest first."""
+def _orthogonalise(modes: FloatArray, count: int) -> FloatArray:
+    """Convert modes (K, count, 3) to orthogonal ones of the same covariance, longest first."""
     if not len(modes):
         return modes.reshape(0, count, 3)
     _, lengths, directions = np.linalg.svd(modes.reshape(len(modes), -1), full_matrices=False)
@@ -77,19 +77,19 @@ def _orthogonal(modes: FloatArray, count: int) -> FloatArray:
 
 
 class Mirror(NamedTuple):
-    """A mirror across an axis, as a category has one whose mirrored objects are as likely."""
+    """A mirror plane perpendicular to an axis."""
 
     axis: int
-    offset: float  # where it stands on that axis [model units]
-    partners: tuple[int, ...]  # the row of each keypoint's mirror image, its own for some
+    offset: float  # coordinate of the plane on the axis [model units]
+    partners: tuple[int, ...]  # row of each keypoint's mirror image; a keypoint may be its own
 
 
 def find_mirror(completed: FloatArray, axis: int) -> Mirror:
-    """Find the pairs of keypoints that a mirror across an axis exchanges best.
+    """Find the mirror plane perpendicular to an axis that maps the models best to themselves.
 
-    Keypoints are paired such that the squared distances between the mirrored keypoints and their
-    partners, over all models, are least, in turns with the place of the mirror. ``completed`` (N, m
-    + 2, 3) are keypoints and box corners of the models, none missing; ``axis`` is 0, 1 or 2.
+    Alternates between the pairs of keypoints, which minimise the squared distances between mirrored
+    keypoints and their partners over all models, and the plane's offset. ``completed`` (N, m + 2,
+    3) are keypoints and box corners, none missing; ``axis`` is 0, 1 or 2.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -101,10 +101,10 @@ def find_mirror(completed: FloatArray, axis: int) -> Mirror:
         mirrored[..., axis] = 2 * offset - mirrored[..., axis]
         gaps = ((mirrored[:, :, None] - points[:, None, :]) ** 2).sum(axis=3).mean(axis=0)
         _, found = linear_sum_assignment(gaps + gaps.T)
-        # A mirror undoes itself; a longer cycle of keypoints is none.
+        # A mirror is its own inverse; longer cycles of keypoints are dropped.
         found = np.where(found[found] == own, found, own)
         midpoints = (points[..., axis] + points[:, found, axis]) / 2
-        # The median, since keypoints without a partner may lie off the mirror.
+        # The median, since keypoints without a partner may lie off the plane.
         offset = float(np.median(midpoints.mean(axis=0)))
         if (found == partner).all():
             break
@@ -113,13 +113,13 @@ def find_mirror(completed: FloatArray, axis: int) -> Mirror:
 
 
 def is_symmetry(completed: FloatArray, mirror: Mirror) -> bool:
-    """True if the mirror image of the mean is as near to it as models are; see `find_mirror`."""
+    """True if the mirrored mean is as near to the mean as the models are; see `find_mirror`."""
     mean = completed.mean(axis=0, keepdims=True)
     return bool(np.abs(mirrored(mean, mirror) - mean).mean() <= np.abs(completed - mean).mean())
 
 
 def mirrored(rows: FloatArray, mirror: Mirror) -> FloatArray:
-    """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing."""
+    """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN if missing."""
     exchanged = rows[:, [*mirror.partners, -BOX_ROWS, -1]]
     exchanged[..., mirror.axis] = -exchanged[..., mirror.axis]
     exchanged[:, [-BOX_ROWS, -1], mirror.axis] = exchanged[:, [-1, -BOX_ROWS], mirror.axis]

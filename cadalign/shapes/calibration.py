@@ -1,13 +1,12 @@
-"""Calibration of a shape model's covariances and tails by models that were held out.
+"""Calibration of a shape model's covariances and tails by held-out models.
 
-An image determines some directions of shape and pose and leaves others to the prior. Where few
-models were learned from, or shapes have heavier tails than Gaussians, errors in the latter are
-larger than the prior's covariance says, and no residual shows it. Held-out models show how much:
-each is seen from random directions in weak perspective, once with all of its keypoints and once
-with a few, and pose and shape follow in closed form, as the equations are linear about the truth.
-Found are a factor of the standard deviations for either number of keypoints, and the degrees of
-freedom of the t distribution that the errors follow, as most objects of a category are nearer to
-the others than a Gaussian of that covariance says, and few far away.
+An image determines some directions of shape and pose; the prior determines the others. If there are
+few training models, or shapes have heavier tails than Gaussians, errors in the latter directions
+exceed the prior's covariance, and no residual shows it. Held-out models measure the excess: each is
+projected from a random direction in weak perspective, once with all of its keypoints and once with
+a few. The equations are linearised about the truth, so pose and shape follow in closed form. The
+calibration finds a factor of the standard deviations for both numbers of keypoints, and the degrees
+of freedom of the errors' t distribution.
 """
 
 from __future__ import annotations
@@ -30,18 +29,18 @@ from cadalign.shapes.parts import (
     probability_within,
 )
 
-_FACTORS = np.geomspace(1.0, 3.0, 12)  # sigmas are never narrowed; the first is no factor
+_FACTORS = np.geomspace(1.0, 3.0, 12)  # at least 1: sigmas are never reduced
 _DEGREES_OF_FREEDOM = (None, 20.0, 10.0, 7.0, 5.0, 4.0, 3.0)
 _LEAST_KEYPOINTS = 4
-_ON_A_LINE = 1e-6  # below which no image tells how points are turned about their line
+_ON_A_LINE = 1e-6  # ratio of extents below which the rotation about the line is undetermined
 _NOMINAL = np.array([0.68, 0.95])
-_TOLERANCE = np.array([0.08, 0.05])  # of these shares of truths
+_TOLERANCE = np.array([0.08, 0.05])  # of the coverage at these probabilities
 _EXCEEDED = 95.0  # percentile of the linear box's errors
-_POSE = 6  # a rotation vector, a translation in the image, the logarithm of the scale
+_POSE = 6  # unknowns: rotation vector, translation in the image, logarithm of the scale
 
 
 class ShapeCalibration(NamedTuple):
-    """Factor of the deviations, and degrees of freedom of the errors; None if Gaussian."""
+    """Factor of the standard deviations, and degrees of freedom of the errors, None if Gaussian."""
 
     inflation: float = 1.0
     degrees_of_freedom: float | None = None
@@ -49,29 +48,29 @@ class ShapeCalibration(NamedTuple):
 
 
 class _View(NamedTuple):
-    """Some of a model's n keypoints, g, in an image.
+    """An image of g of a model's n keypoints.
 
-    ``entries`` (3 n,) of the shape vector; derivatives of the image ``by_shape`` (2 g, 3 n) and
-    ``by_pose`` (2 g, 6), rotation first; the image ``seen`` (2 g,) and the ``truth`` (n, 3).
+    ``entries`` (3 n,) index the shape vector. ``by_shape`` (2 g, 3 n) and ``by_pose`` (2 g, 6) are
+    derivatives of the image, ``image`` (2 g,) the observed and ``truth`` (n, 3) the true points.
     """
 
     entries: IntArray
     by_shape: FloatArray
     by_pose: FloatArray
-    seen: FloatArray
+    image: FloatArray
     truth: FloatArray
 
 
 def calibrate(
     parts: Iterable[tuple[FloatArray, Gaussians]], *, sigma: float, rng: np.random.Generator
 ) -> ShapeCalibration:
-    """Find the factor and tails at which held-out truths lie where they should.
+    """Find the factor and the degrees of freedom with the best coverage of held-out truths.
 
-    Shares of truths in regions of rotations and of keypoints, given or not, are to differ least
-    from their nominal probabilities, in the sum of squares. ``parts`` are models (N, m + 2, 3), NaN
-    for what they lack, with the mixture learned without them; ``sigma`` is the standard deviation
-    of the image's noise [model units]; ``rng`` draws directions, given keypoints and noise. The
-    factor is 1 or more; without a model of enough keypoints it is 1, and errors are Gaussian.
+    The coverage of the regions of rotations and keypoints is compared with nominal probabilities,
+    by least squares. ``parts`` are held-out models (N, m + 2, 3), NaN if missing, each with the
+    mixture learned without them. ``sigma`` is the standard deviation of the image's noise [model
+    units]. ``rng`` draws directions, given keypoints and noise. The factor is at least 1. Without
+    a model of enough keypoints it is 1, and errors are Gaussian.
     """
     every: list[tuple[FloatArray, FloatArray]] = []
     few: list[tuple[FloatArray, FloatArray]] = []
@@ -83,17 +82,17 @@ def calibrate(
             if count >= _LEAST_KEYPOINTS and not are_on_a_line(row[known], _ON_A_LINE):
                 counts.append(count)
                 view = _view(known, np.arange(count), row, sigma, rng)
-                every.append(_squares(view, mixture, sigma))
+                every.append(_squared_errors(view, mixture, sigma))
             given = rng.permutation(count)[:FEW] if count > FEW else None
             if given is not None and not are_on_a_line(row[known[given]], _ON_A_LINE):
                 view = _view(known, given, row, sigma, rng)
-                few.append(_squares(view, mixture, sigma))
+                few.append(_squared_errors(view, mixture, sigma))
     if not counts:
         return ShapeCalibration()
-    gaps, typical = _departures(every)[:, :, None], float(np.mean(counts))
+    gaps, typical = _coverage_errors(every)[:, :, None], float(np.mean(counts))
     if few and typical > FEW:
-        is_less = np.tri(len(_FACTORS), dtype=bool)  # or as large
-        gaps = np.where(is_less, gaps + _departures(few)[:, None], np.inf)
+        is_less = np.tri(len(_FACTORS), dtype=bool)  # or equal
+        gaps = np.where(is_less, gaps + _coverage_errors(few)[:, None], np.inf)
     freedom, row, lower = np.unravel_index(np.argmin(gaps), gaps.shape)
     factor, of_few = float(_FACTORS[row]), None
     if gaps.shape[2] > 1:
@@ -101,11 +100,8 @@ def calibrate(
     return ShapeCalibration(factor, _DEGREES_OF_FREEDOM[freedom], of_few)
 
 
-def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """Squared departures of coverage from its nominal values, in tolerances; see `_squares`.
-
-    By degrees of freedom and factor, the sum of those of rotations and of keypoints.
-    """
+def _coverage_errors(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """Squared differences of coverage from nominal, by degrees of freedom and factor."""
     turned = np.array([each for each, _ in squares])
     moved = np.concatenate([each for _, each in squares], axis=1).T
     found = np.zeros((len(_DEGREES_OF_FREEDOM), len(_FACTORS)))
@@ -120,7 +116,7 @@ def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
 def _view(
     known: IntArray, given: IntArray, row: FloatArray, sigma: float, rng: np.random.Generator
 ) -> _View:
-    """A random view of a model's known keypoints (n,), of which some are given (g,)."""
+    """Draw a view of a model's known keypoints (n,), of which (g,) are given."""
     quat = rng.standard_normal(4)
     rotation = rotation_from_quat_wxyz(quat / np.linalg.norm(quat))
     points = row[known]
@@ -132,35 +128,34 @@ def _view(
     by_pose[:, :, 5] = turned[:, :2]
     by_shape = np.asarray(np.kron(np.eye(len(known))[given], rotation[:2]), dtype=float)
     entries = (3 * known[:, None] + np.arange(3)).ravel()
-    seen = by_shape @ points.ravel() + sigma * rng.standard_normal(len(by_shape))
-    return _View(entries, by_shape, by_pose.reshape(-1, _POSE), seen, points)
+    image = by_shape @ points.ravel() + sigma * rng.standard_normal(len(by_shape))
+    return _View(entries, by_shape, by_pose.reshape(-1, _POSE), image, points)
 
 
 class _Posterior(NamedTuple):
     """Pose (6,) and keypoints (n, 3) given an image and one Gaussian.
 
-    Covariances of the rotation (F, 3, 3) and of each keypoint (F, n, 3, 3) are those with the
-    standard deviations widened by every factor.
+    Covariances of the rotation (F, 3, 3) and of each keypoint (F, n, 3, 3) are for each of F
+    factors of the prior's standard deviations.
     """
 
     pose: FloatArray
     points: FloatArray
-    of_turn: FloatArray
-    of_points: FloatArray
+    rotation_covariance: FloatArray
+    point_covariances: FloatArray
     log_evidence: float
 
 
 def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: float) -> _Posterior:
-    """Generalised least squares for the pose, whose prior is flat, then the shape given it.
+    """Estimate the pose, with a flat prior, by generalised least squares, then the shape.
 
-    In the eigenvectors of the shape's covariance in the image, the covariances by all factors,
-    noise included, are diagonal. The factors' powers are multiplied last.
+    In the eigenbasis of the shape's covariance in the image, covariances are diagonal.
     """
     n, squares = len(mean) // 3, _FACTORS**2
     across = view.by_shape @ covariance
     values, vectors = np.linalg.eigh(across @ view.by_shape.T)
     precisions = 1 / (squares[:, None] * np.maximum(values, 0.0) + sigma**2)  # (F, 2 g)
-    known = np.column_stack([view.seen - view.by_shape @ mean, view.by_pose])
+    known = np.column_stack([view.image - view.by_shape @ mean, view.by_pose])
     known, across = vectors.T @ known, vectors.T @ across
     gap, by_pose = known[:, 0], known[:, 1:]
     weighted = by_pose.T * precisions[:, None]  # (F, 6, 2 g)
@@ -168,12 +163,12 @@ def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: flo
     gain = weighted @ across  # (F, 6, 3 n)
     blocks = across.reshape(-1, n, 3)
     pairs = (blocks[..., :, None] * blocks[..., None, :]).reshape(len(across), -1)
-    told = (precisions @ pairs).reshape(-1, n, 3, 3)
+    reduction = (precisions @ pairs).reshape(-1, n, 3, 3)
     by_point = (-1, _POSE, n, 3)
     left = (of_pose @ gain).reshape(by_point).transpose(0, 2, 3, 1)
-    told -= left @ gain.reshape(by_point).transpose(0, 2, 1, 3)
+    reduction -= left @ gain.reshape(by_point).transpose(0, 2, 1, 3)
     own = np.einsum("iaib->iab", covariance.reshape(n, 3, n, 3))
-    first = precisions[0]  # without a factor, as estimates are
+    first = precisions[0]  # estimates do not use the factor
     pose = of_pose[0] @ (weighted[0] @ gap)
     gap = gap - by_pose @ pose
     rest = first * gap
@@ -182,16 +177,16 @@ def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: flo
         pose,
         (mean + rest @ across).reshape(-1, 3),
         of_pose[:, :3, :3],
-        each * own - each**2 * told,
+        each * own - each**2 * reduction,
         float(np.linalg.slogdet(of_pose[0])[1] / 2 + np.log(first).sum() / 2 - rest @ gap / 2),
     )
 
 
-def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Squared errors in standard deviations of the rotation (F,) and each keypoint (F, n).
+def _squared_errors(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Squared errors, in standard deviations, of the rotation (F,) and each keypoint (F, n).
 
-    Covariances are the second moments of the mixture about the likeliest component's estimate, as
-    `cadalign.align` states them.
+    As in `cadalign.align`, covariances are the second moments of the mixture about the likeliest
+    component's estimate.
     """
     means = mixture.means[:, view.entries]
     covariances = mixture.covariances[:, view.entries[:, None], view.entries]
@@ -202,19 +197,20 @@ def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray,
     logs = np.log(mixture.weights) + np.array([each.log_evidence for each in found])
     shares = np.exp(logs - np.logaddexp.reduce(logs))
     best = found[int(np.argmax(shares))]
-    of_turn, of_points = np.zeros_like(best.of_turn), np.zeros_like(best.of_points)
+    rotation = np.zeros_like(best.rotation_covariance)
+    points = np.zeros_like(best.point_covariances)
     for share, each in zip(shares, found, strict=True):
         turn, steps = (each.pose - best.pose)[:3], each.points - best.points
-        of_turn += share * (each.of_turn + np.outer(turn, turn))
-        of_points += share * (each.of_points + steps[:, :, None] * steps[:, None])
+        rotation += share * (each.rotation_covariance + np.outer(turn, turn))
+        points += share * (each.point_covariances + steps[:, :, None] * steps[:, None])
     turn, gaps = best.pose[:3, None], (best.points - view.truth)[:, :, None]
-    turned = turn * np.linalg.solve(of_turn, np.broadcast_to(turn, (len(of_turn), 3, 1)))
-    solved = np.linalg.solve(of_points, np.broadcast_to(gaps, (*of_points.shape[:-1], 1)))
+    turned = turn * np.linalg.solve(rotation, np.broadcast_to(turn, (len(rotation), 3, 1)))
+    solved = np.linalg.solve(points, np.broadcast_to(gaps, (*points.shape[:-1], 1)))
     return turned.sum(axis=(1, 2)), (gaps * solved).sum(axis=(2, 3))
 
 
-def excesses_of(rows: FloatArray, mixture: Gaussians) -> FloatArray:
-    """Distances of linear boxes beyond the true faces of models that were held out, (N, 2, 3)."""
+def box_excesses(rows: FloatArray, mixture: Gaussians) -> FloatArray:
+    """Distances of linear boxes beyond the true faces of held-out models, (N, 2, 3)."""
     without = rows.copy()
     without[:, -BOX_ROWS:] = np.nan
     vectors = Vectors(without.reshape(len(rows), -1), np.ones(len(rows)))
@@ -223,7 +219,7 @@ def excesses_of(rows: FloatArray, mixture: Gaussians) -> FloatArray:
 
 
 def learn_margins(rows: FloatArray, excesses: FloatArray) -> BoxMargins | None:
-    """Margins from models and their linear boxes' errors; None where no model has a box."""
+    """Learn margins from models and `box_excesses`; None if no model has a box."""
     has_box = np.isfinite(rows[:, -BOX_ROWS:]).all(axis=(1, 2))
     if not has_box.any():
         return None

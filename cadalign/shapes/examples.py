@@ -1,4 +1,4 @@
-"""Training data of a shape model: models of a category with identified keypoints."""
+"""Training data of a shape model: models of a category with labelled keypoints."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from cadalign.shapes.parts import (
     BOX_ROWS,
     KeypointId,
     TrainingShapes,
+    check_box,
     check_ids,
     check_text,
-    checked_box,
 )
 
 logger = logging.getLogger("cadalign")
 
 LEAST_MODELS = 4
-_LEAST_TO_MEASURE = 4  # keypoints; fewer may be near each other
+_LEAST_TO_MEASURE = 4  # keypoints for a size; fewer may be near each other
 _LARGEST_RATIO = 20.0  # of models' sizes in one unit; an inch is 25 mm
-_LEAST_TO_TURN = 5  # keypoints; the turn of fewer may be their own
-_TURNED_RATIO = 0.4  # of distances from the others' keypoints, turned over as it is
-_ALIKE = 0.1  # such a distance as it is, over the radius, of models that need no turn
-# All ways to exchange and reverse three axes, (48, 3, 3), the identity first.
+_LEAST_TO_TURN = 5  # keypoints for a comparison of axes
+_TURNED_RATIO = 0.4  # distance from the other models with other axes, over the distance without
+_ALIKE = 0.1  # distance from the other models, over the radius, at which axes are right
+# All permutations of three axes with signs, (48, 3, 3), the identity first.
 _AXES = np.array(
     sorted(
         (
@@ -43,30 +43,30 @@ _AXES = np.array(
         key=lambda turn: -float(np.trace(turn)),
     )
 )
-_FARTHEST = 0.1  # gap between all keypoints and the box, over its diagonal: thin parts, rounding
+_FARTHEST = 0.1  # allowed gap between all keypoints and the box, over the box's diagonal
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """One model to learn from.
+    """A training model of a shape model.
 
     Raises
     ------
     InputError
-        If shapes don't match, a value is NaN or infinite, an id occurs twice, ids are of two kinds,
-        or the bounds are upside down.
+        If shapes don't match, a value is NaN or infinite, an id occurs twice, ids are both numbers
+        and names, the bounds are not in order, or no keypoint is near them.
     """
 
     model_id: str
-    """Its name, for messages and to find it again."""
+    """Unique name of the model."""
     ids: Sequence[KeypointId]
-    """(n,) int or str, semantic ids or names of its keypoints."""
+    """(n,) int or str, semantic ids or names of the keypoints."""
     points_3d: FloatArray
-    """(n, 3), the keypoints [model units]."""
+    """(n, 3), keypoints [model units]."""
     bounds: FloatArray | None = None
-    """(2, 3), the least and the greatest corner of its bounding box [model units]."""
+    """(2, 3), least and greatest corner of the bounding box [model units]."""
     mesh_path: Path | None = None
-    """Its mesh."""
+    """Mesh file."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "model_id", check_text(self.model_id, "model_id"))
@@ -79,7 +79,7 @@ class Example:
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "points_3d", read_only(points))
         if self.bounds is not None:
-            bounds = checked_box(self.bounds, f"{where}, bounds")
+            bounds = check_box(self.bounds, f"{where}, bounds")
             least, greatest = extent(points)
             gap = np.maximum(least - bounds[1], bounds[0] - greatest).max()
             if gap > _FARTHEST * np.linalg.norm(bounds[1] - bounds[0]):
@@ -102,9 +102,9 @@ class Dataset(Protocol):
 
 
 def examples_of(models: Sequence[Any], *, meshes: bool) -> list[Example]:
-    """Convert `cadalign.datasets.AnnotatedModel`s; their boxes are those of the meshes.
+    """Convert `cadalign.datasets.AnnotatedModel`s to examples.
 
-    If less than half have a mesh, boxes are left out.
+    ``meshes`` reads the boxes from the meshes if at least half of the models have one.
     """
     with_mesh = sum(model.mesh_path is not None for model in models)
     measured = meshes and with_mesh > 0 and 2 * with_mesh >= len(models)
@@ -115,21 +115,21 @@ def examples_of(models: Sequence[Any], *, meshes: bool) -> list[Example]:
             try:
                 bounds = model.load_mesh(check=False).bounds
             except DataError as error:
-                logger.warning("its bounding box is taken as unknown: %s", error)
+                logger.warning("the bounding box of a model is unknown: %s", error)
         path = None if model.mesh_path is None else model.mesh_path.absolute()
         ids = [int(label) for label in model.keypoints.ids]
         examples.append(Example(model.model_id, ids, model.keypoints.xyz, bounds, path))
     return examples
 
 
-def tabulated(
+def tabulate(
     examples: Sequence[Example], category: str
 ) -> tuple[tuple[KeypointId, ...], FloatArray, TrainingShapes]:
-    """Models as rows of one array: all ids that a model has, sorted, and the rows.
+    """Check training models and stack them; returns ids, rows and training shapes.
 
-    Rows (N, m + 2, 3) are keypoints and box corners, NaN for what a model lacks. If less than half
-    of the models have bounds, the boxes are those of the keypoints. For the errors raised see
-    `ShapeModel.learn`.
+    The ids are those of all models, sorted. Rows (N, m + 2, 3) are keypoints and box corners, NaN
+    if missing. If fewer than half of the models have bounds, the extents of the keypoints are used.
+    For the errors raised see `ShapeModel.learn`.
     """
     for number, each in enumerate(examples):
         fix = "`cadalign shape learn` takes the folder of a data set"
@@ -165,9 +165,9 @@ def _check_names(examples: Sequence[Example]) -> None:
     seen: set[str] = set()
     for each, kind in zip(examples, kinds, strict=True):
         if kind != first:
-            what = f"its keypoints have {kind} as ids, those of model {examples[0].model_id} have "
+            what = f"keypoint ids are {kind}, but {first} in model {examples[0].model_id}"
             where, fix = f"model {each.model_id}", "use one kind in all models"
-            raise InputError(what + first, where=where, fix=fix)
+            raise InputError(what, where=where, fix=fix)
         if each.model_id in seen:
             raise InputError("occurs twice", where=f"model {quote(each.model_id)}")
         seen.add(each.model_id)
@@ -176,7 +176,7 @@ def _check_names(examples: Sequence[Example]) -> None:
 
 
 def _check_shared(examples: Sequence[Example]) -> None:
-    """Refuse groups of models without a keypoint in common: nothing relates their shapes."""
+    """Refuse groups of models without a common keypoint, whose shapes cannot be compared."""
     groups: list[tuple[Example, set[KeypointId]]] = []
     for each in examples:
         joined = [group for group in groups if not group[1].isdisjoint(each.ids)]
@@ -185,13 +185,13 @@ def _check_shared(examples: Sequence[Example]) -> None:
         groups.append((first, set(each.ids).union(*(ids for _, ids in joined))))
     if len(groups) > 1:
         one, other = (quote(first.model_id) for first, _ in groups[:2])
-        what = f"{len(groups)} groups of them share no keypoint, such as those of {one} and {other}"
+        what = f"{len(groups)} groups share no keypoint, for example those of {one} and {other}"
         fix = "give the same keypoint the same id in all models"
         raise InputError(what, where="models", fix=fix)
 
 
 def _warn_of_units(examples: Sequence[Example]) -> None:
-    """Warn of models that are so much larger or smaller than the others as another unit makes."""
+    """Warn of models whose size suggests another unit."""
     whole = [each for each in examples if len(each.ids) >= _LEAST_TO_MEASURE]
     sizes = np.array([np.linalg.norm(np.ptp(each.points_3d, axis=0)) for each in whole])
     typical = float(np.median(sizes)) if whole else 0.0
@@ -203,7 +203,7 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
 
 
 def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
-    """Warn of models whose keypoints (m, 3) are the others' once axes are exchanged or reversed."""
+    """Warn of models that fit the others only if axes are exchanged or reversed."""
     count = np.isfinite(rows[..., 0]).sum(axis=1)
     some = np.flatnonzero(count >= _LEAST_TO_TURN)
     if not len(some):
@@ -229,12 +229,12 @@ def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
 
 
 def _warn(what: str, count: int, examples: Sequence[Example], odd: Example, why: str) -> None:
-    said = "models %s than the others: %d of %d, such as %s, whose keypoints %s"
-    logger.warning(said, what, count, len(examples), quote(odd.model_id), why)
+    text = "models %s than the others: %d of %d, such as %s, whose keypoints %s"
+    logger.warning(text, what, count, len(examples), quote(odd.model_id), why)
 
 
 def _unit(points: FloatArray) -> FloatArray:
-    """Points (n, 3), or NaN, about their mean, with a mean square distance of 1 from it."""
+    """Normalise points (n, 3), NaN if missing, to mean 0 and mean squared distance 1."""
     centred = points - np.nanmean(points, axis=0)
     radius = np.sqrt(np.nanmean((centred**2).sum(axis=1)))
     return np.asarray(centred / radius if radius > 0 else centred)

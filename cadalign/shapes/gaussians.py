@@ -1,8 +1,8 @@
 """Mixtures of Gaussians, learned from vectors with missing entries.
 
 Expectation maximisation as in Ghahramani and Jordan, "Supervised learning from incomplete data via
-an EM approach", NIPS 1994, with a prior that draws each covariance towards a common one, so that
-components of few vectors keep sensible covariances.
+an EM approach", NIPS 1994. A prior draws each covariance towards a common one, for components of
+few vectors.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ class Gaussians(NamedTuple):
     covariances: FloatArray
 
     def widened(self, sigma: float) -> Gaussians:
-        """The distribution of the vectors with independent noise in every entry."""
+        """Add independent noise to every entry; returns the new distribution."""
         noise = sigma**2 * np.eye(self.means.shape[1])
         return Gaussians(self.weights, self.means, self.covariances + noise)
 
 
 class Conditional(NamedTuple):
-    """A Gaussian of vectors, given the entries that these have.
+    """A Gaussian conditioned on the known entries of vectors.
 
-    The lower ``root`` (d, d) of its covariance, and ``offsets`` (N, d) from its mean, 0 for what is
-    missing. Of each of `Vectors.gaps`, the root of the inverse covariance of its l missing
-    entries, given the others, and how far below the mean these are expected, (l, r).
+    ``root`` (d, d) is the lower Cholesky factor of the covariance, ``offsets`` (N, d) are the
+    entries minus the mean, 0 if missing. For each of `Vectors.gaps`, ``gaps`` holds the Cholesky
+    factor (l, l) of the missing entries' conditional precision, and the mean minus their
+    conditional expectation (l, r).
     """
 
     root: FloatArray
@@ -52,17 +53,17 @@ class Conditional(NamedTuple):
 class Vectors:
     """Weighted vectors with missing entries."""
 
-    values: FloatArray  # (N, d), NaN for what is missing; every vector has an entry
-    weights: FloatArray  # (N,), how often each vector counts
+    values: FloatArray  # (N, d), NaN if missing; every vector has an entry
+    weights: FloatArray  # (N,)
 
     @cached_property
     def has(self) -> BoolArray:
-        """Mark the entries that are not missing, (N, d)."""
+        """Mask of the known entries, (N, d)."""
         return ~np.isnan(self.values)
 
     @cached_property
     def gaps(self) -> tuple[tuple[IntArray, IntArray], ...]:
-        """Rows (r, 1) of the vectors that lack the same entries, and these entries (l,)."""
+        """Groups of vectors that lack the same entries: rows (r, 1) and missing entries (l,)."""
         lacking = np.flatnonzero(~self.has.all(axis=1))
         bits = np.packbits(self.has[lacking], axis=1)  # sorted faster than the entries themselves
         _, first, kind_of = np.unique(bits, axis=0, return_index=True, return_inverse=True)
@@ -72,12 +73,12 @@ class Vectors:
         )
 
     def offsets(self, mean: FloatArray) -> FloatArray:
-        """Distances of the entries from a mean (d,), 0 for what is missing."""
+        """Subtract a mean (d,) from the entries, (N, d); 0 if missing."""
         return np.where(self.has, self.values - mean, 0.0)
 
     @cached_property
     def mean(self) -> FloatArray:
-        """Mean of each entry; of the entries that no vector has, the mean of all entries."""
+        """Mean of each entry, (d,); for entries that no vector has, the mean of all entries."""
         totals = np.where(self.has, self.weights[:, None], 0.0).sum(axis=0)
         sums = (self.weights[:, None] * np.where(self.has, self.values, 0.0)).sum(axis=0)
         overall = sums.sum() / totals.sum()
@@ -89,7 +90,7 @@ class Vectors:
         return float(np.nanmean((self.values - self.mean) ** 2))
 
     def completed(self, model: Gaussians) -> FloatArray:
-        """The vectors with the missing entries that their likeliest component expects, (N, d)."""
+        """Fill missing entries with their expectations under the likeliest component, (N, d)."""
         given, unweighted = _conditionals(self, model), np.zeros(len(self.values))
         likeliest = _log_densities(self, model, given).argmax(axis=1)
         pairs = zip(model.means, given, strict=True)
@@ -98,13 +99,13 @@ class Vectors:
 
 
 def log_likelihoods(vectors: Vectors, model: Gaussians) -> FloatArray:
-    """Log density of the entries of every vector under a mixture, (N,) float."""
+    """Log density of each vector's known entries under a mixture, (N,) float."""
     densities = _log_densities(vectors, model, _conditionals(vectors, model))
     return np.asarray(np.logaddexp.reduce(densities, axis=1))
 
 
 def learn_gaussian(vectors: Vectors, *, strength: float, floor: float, rounds: int) -> Gaussians:
-    """Learn one Gaussian; its covariance is drawn towards that of independent, equal entries."""
+    """Learn one Gaussian; its covariance is drawn towards a multiple of the identity."""
     width = (vectors.variance + floor**2) * np.eye(vectors.values.shape[1])
     start = Gaussians(np.ones(1), vectors.mean[None], width[None])
     model, prior = start, (width, strength, floor)
@@ -123,11 +124,11 @@ def learn_mixture(
     floor: float,
     rounds: int,
 ) -> Gaussians:
-    """Learn a mixture from a first clustering.
+    """Learn a mixture from an initial clustering.
 
-    ``labels`` (N,) are the components that the vectors start in, ``common`` is the Gaussian of all,
-    from which the components start. Covariances are drawn towards their mean over the components;
-    for ``strength`` and ``floor`` see `_maximise`.
+    ``labels`` (N,) are the vectors' initial components, ``common`` is the Gaussian of all vectors,
+    the initial value of each component. Covariances are drawn towards their mean over the
+    components. For ``strength`` and ``floor`` see `_maximise`.
     """
     count = int(labels.max()) + 1
     model = Gaussians(
@@ -149,13 +150,13 @@ def learn_mixture(
 
 
 def _conditionals(vectors: Vectors, model: Gaussians) -> list[Conditional]:
-    """Every component, given the entries that the vectors have."""
+    """Condition every component on the known entries."""
     found = []
     for mean, covariance in zip(model.means, model.covariances, strict=True):
         root, offsets, gaps = _root(covariance), vectors.offsets(mean), []
         if vectors.gaps:
             precision = _inverse(root)
-            pulled = multiplied(offsets, precision)
+            pulled = multiply(offsets, precision)
             for rows, missing in vectors.gaps:
                 of_gap = _root(precision[missing[:, None], missing])
                 below = np.array(pulled[rows, missing].T, order="C")
@@ -166,14 +167,14 @@ def _conditionals(vectors: Vectors, model: Gaussians) -> list[Conditional]:
 
 
 def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Conditional]) -> FloatArray:
-    """Log of weight times density of every vector under every component, (N, g) float."""
+    """Log of weight times density of each vector under each component, (N, g) float."""
     found = np.empty((len(vectors.values), len(model.weights)))
     constants = vectors.has.sum(axis=1) / 2 * math.log(2 * math.pi)
     for number, (root, offsets, gaps) in enumerate(given):
-        whitened = multiplied(_inverse_factor(root), np.ascontiguousarray(offsets.T))
+        whitened = multiply(_inverse_factor(root), np.ascontiguousarray(offsets.T))
         squares = np.einsum("nr,nr->r", whitened, whitened)
         volumes = constants + np.log(root.diagonal()).sum()
-        # The density of all entries, integrated over those that are missing.
+        # The density of all entries, integrated over the missing ones.
         for (rows, _), (of_gap, below) in zip(vectors.gaps, gaps, strict=True):
             pulled = of_gap.T @ below
             squares[rows[:, 0]] -= np.einsum("lr,lr->r", pulled, pulled)
@@ -186,7 +187,7 @@ def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Condition
 def _expect(
     vectors: Vectors, shares: FloatArray, mean: FloatArray, given: Conditional
 ) -> tuple[FloatArray, FloatArray]:
-    """Expected vectors, and the covariance of what is missing, summed with shares as weights."""
+    """Expected vectors (N, d), and the sum, weighted by shares, of their covariances (d, d)."""
     completed, spread = vectors.values.copy(), np.zeros_like(given.root)
     for (rows, missing), (of_gap, below) in zip(vectors.gaps, given.gaps, strict=True):
         completed[rows, missing] = mean[missing] - below.T
@@ -201,10 +202,10 @@ def _maximise(
     given: Sequence[Conditional],
     prior: tuple[FloatArray, float, float],
 ) -> Gaussians:
-    """One round: the mixture that makes the completed vectors most likely.
+    """Maximisation step: the mixture with the largest likelihood of the completed vectors.
 
-    The prior is what covariances are drawn towards (d, d), the number of vectors that it counts
-    as, and the standard deviation that no direction falls below.
+    ``prior`` is the covariance (d, d) that covariances are drawn towards, its strength as a number
+    of vectors, and the least standard deviation in any direction.
     """
     means, covariances = [], []
     towards, strength, floor = prior
@@ -213,7 +214,7 @@ def _maximise(
         mean = share @ completed + _UNSEEN * model.means[number]
         mean /= share.sum() + _UNSEEN
         offsets = completed - mean
-        scatter = multiplied(offsets.T, share[:, None] * offsets) + spread
+        scatter = multiply(offsets.T, share[:, None] * offsets) + spread
         scatter += (strength + _UNSEEN) * towards
         covariance = scatter / (share.sum() + strength + _UNSEEN)
         covariance[np.diag_indices_from(covariance)] += floor**2
@@ -223,10 +224,10 @@ def _maximise(
     return Gaussians(totals / totals.sum(), np.array(means), np.array(covariances))
 
 
-# Compiled here, and so are products: BLAS shares such small matrices out among threads, which takes
-# 30 times as long on a busy machine.
+# These and products are compiled, since BLAS uses threads even for such small matrices, which is
+# slow on a busy machine.
 def _root(covariance: FloatArray) -> FloatArray:
-    """The lower Cholesky factor."""
+    """Lower Cholesky factor of a covariance."""
     root = np.tril(covariance)
     if not factorize(root):
         raise np.linalg.LinAlgError("a covariance is not positive definite")
@@ -234,14 +235,14 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 def _inverse(root: FloatArray) -> FloatArray:
-    """The inverse of the matrix that has the root."""
+    """Inverse of the matrix with the given Cholesky factor."""
     half = _inverse_factor(root)
-    return multiplied(half.T, half)
+    return multiply(half.T, half)
 
 
 @fast_sums
 def _inverse_factor(factor: FloatArray) -> FloatArray:
-    """The inverse of the lower triangle that `factorize` left."""
+    """Inverse of the lower triangle of a factor from `factorize`."""
     size = factor.shape[0]
     inverse = np.zeros((size, size))
     for i in range(size):
@@ -255,8 +256,8 @@ def _inverse_factor(factor: FloatArray) -> FloatArray:
 
 
 @fast_sums
-def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The matrix product (n, k) of (n, m) and (m, k), in one thread."""
+def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Matrix product (n, k) of (n, m) and (m, k), in one thread."""
     found = np.zeros((first.shape[0], second.shape[1]))
     for i in range(first.shape[0]):
         own = found[i]

@@ -1,7 +1,7 @@
-"""Learning of a shape model's components; what is not given is chosen by held-out likelihood.
+"""Learning of a shape model's components, with hyperparameters chosen by cross-validation.
 
-Likelihoods are those of the keypoints as an image shows them, at an accuracy of `_RESOLUTION`:
-finer detail would decide otherwise, though no photo shows it.
+Likelihoods are computed at the accuracy of images, `_RESOLUTION`, so that details which no photo
+shows do not decide.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from cadalign.shapes.basis import (
     is_symmetry,
     mirrored,
 )
-from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
-from cadalign.shapes.examples import Example, tabulated
+from cadalign.shapes.calibration import ShapeCalibration, box_excesses, calibrate, learn_margins
+from cadalign.shapes.examples import Example, tabulate
 from cadalign.shapes.gaussians import (
     Gaussians,
     Vectors,
@@ -37,18 +37,18 @@ from cadalign.shapes.parts import BoxMargins
 
 # Lengths relative to the models' median diagonal.
 _FLOOR = 1e-3
-_RESOLUTION = 5e-3  # 2 px where an object's diagonal has 400
-_UNLIKE = 0.01  # share of models
-_TOLERANCE = 0.5  # of the mean logarithm of a model's likelihood
-_MODE_TOLERANCE = 0.1  # modes cost next to nothing
+_RESOLUTION = 5e-3  # 2 px for an object's diagonal of 400 px
+_UNLIKE = 0.01  # share of models that are outliers
+_TOLERANCE = 0.5  # in the mean log-likelihood of models
+_MODE_TOLERANCE = 0.1  # smaller, since modes cost little time
 _FOLDS = 3
 _MOST_CALIBRATED = 80  # models of a fold
-_LEAST_TO_CHOOSE = 12  # models, below which each is held out alone, and little is chosen
+_LEAST_TO_CHOOSE = 12  # fewer models are held out one by one, with fewer choices
 _ROUNDS = 25
 _STRENGTHS = (0.0, 0.1, 1.0, 10.0)
 _STRENGTHS_OF_FEW = (0.1, 1.0)
 _MIXTURE_STRENGTH = 10.0
-_MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
+_MOST_COMPONENTS = 4  # aligning an image takes one search for each
 _CLUSTER_MODES = 10
 _CLUSTERINGS = 5
 _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
@@ -56,7 +56,7 @@ _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
 
 @dataclass(frozen=True)
 class _Recipe:
-    """Choices that are made before the components are learned."""
+    """Hyperparameters of learning."""
 
     strength: float = _STRENGTHS[1]
     mirror: Mirror | None = None
@@ -67,12 +67,12 @@ class _Recipe:
 class _Models:
     """Models to learn from."""
 
-    rows: FloatArray  # (N, m + 2, 3), keypoints and box corners, NaN where missing
-    size: float  # their median diagonal
-    _known: dict[_Recipe, tuple[Vectors, Gaussians]] = field(default_factory=dict)
+    rows: FloatArray  # (N, m + 2, 3), keypoints and box corners, NaN if missing
+    size: float  # median diagonal
+    _cache: dict[_Recipe, tuple[Vectors, Gaussians]] = field(default_factory=dict)
 
-    def some(self, chosen: BoolArray) -> _Models:
-        """A part of the models."""
+    def subset(self, chosen: BoolArray) -> _Models:
+        """Select models by a mask (N,)."""
         return _Models(self.rows[chosen], self.size)
 
     @cached_property
@@ -81,24 +81,24 @@ class _Models:
         return _vectors(self.rows, None)
 
     def completed(self) -> FloatArray:
-        """The models with their expected missing keypoints, (N, m + 2, 3) float."""
+        """Fill missing keypoints with their expectations, (N, m + 2, 3) float."""
         common = self.common(_Recipe(strength=0.0))[1]
         return self.vectors.completed(common).reshape(self.rows.shape)
 
     def common(self, recipe: _Recipe) -> tuple[Vectors, Gaussians]:
-        """Vectors to learn from, and the Gaussian of all, which recipes of mixtures share."""
+        """Vectors to learn from and the Gaussian of all, which all numbers of components share."""
         single = replace(recipe, components=1)
-        if single not in self._known:
+        if single not in self._cache:
             vectors = self.vectors
             if recipe.mirror is not None:
                 vectors = _vectors(self.rows, recipe.mirror)
             floor, strength = _FLOOR * self.size, recipe.strength
             gaussian = learn_gaussian(vectors, strength=strength, floor=floor, rounds=_ROUNDS)
-            self._known[single] = vectors, gaussian
-        return self._known[single]
+            self._cache[single] = vectors, gaussian
+        return self._cache[single]
 
     def mixture(self, recipe: _Recipe) -> Gaussians:
-        """Learn by a recipe."""
+        """Learn a mixture by a recipe."""
         vectors, common = self.common(recipe)
         if recipe.components == 1:
             return common
@@ -114,8 +114,8 @@ class _Models:
     def log_likelihoods(self, mixture: Gaussians) -> FloatArray:
         """Log-likelihood of each model at the resolution of images, (N,) float.
 
-        One model in a hundred is taken as unlike any other, so that a few of these, whose
-        likelihood may be of any order, don't decide between mixtures.
+        A broad component for 1 % of the models limits the influence of outliers on the choice
+        between mixtures.
         """
         common = log_likelihoods(self.vectors, mixture.widened(_RESOLUTION * self.size))
         broad = Gaussians(
@@ -129,71 +129,67 @@ class _Models:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A recipe, what is learned by it without each fold, and how likely that makes the folds."""
+    """Result of cross-validation of a recipe."""
 
     recipe: _Recipe
-    learned: tuple[Gaussians, ...]
-    scores: FloatArray  # (N,), log-likelihood of each model under what was learned without its fold
+    learned: tuple[Gaussians, ...]  # one for each fold, learned from the other folds
+    scores: FloatArray  # (N,), log-likelihood of each model, held out
 
 
 class _CrossValidation:
-    """Recipes compared by the likelihood of models that were held out."""
+    """Choice of a recipe by the likelihood of held-out models."""
 
     def __init__(self, models: _Models) -> None:
         self._models = models
         count = len(models.rows)
         folds = _FOLDS if count >= _LEAST_TO_CHOOSE else count
         self._folds = np.random.default_rng(0).permutation(count) % folds
-        self._kept = [models.some(self._folds != fold) for fold in range(folds)]
-        self._held_out = [models.some(self._folds == fold) for fold in range(folds)]
+        self._kept = [models.subset(self._folds != fold) for fold in range(folds)]
+        self._held_out = [models.subset(self._folds == fold) for fold in range(folds)]
 
     def choose(self, components: int | None) -> tuple[_Recipe, int | None, dict[str, Any]]:
-        """Choose a recipe and the number of modes; the fields that calibrate what they give.
-
-        Few models tell nothing but how strongly covariances are to be drawn to equal entries, and
-        how far from the truth estimates are.
-        """
+        """Choose a recipe and the number of modes, and calibrate them; returns also the fields."""
         count = len(self._models.rows)
         is_few, modes = count < _LEAST_TO_CHOOSE, None
         strengths = _STRENGTHS_OF_FEW if is_few else _STRENGTHS
         best = self._best(_Recipe(each) for each in strengths)
         if is_few:
             recipe = replace(best.recipe, components=components or 1)
-            if recipe.components > 1:  # but for one model each
+            if recipe.components > 1:  # at most one for each model of a fold
                 most = min(recipe.components, count - 1)
                 best = self._try(replace(recipe, components=most))
         else:
-            best = self._with_components(self._with_mirror(best), components)
-            recipe, modes = best.recipe, self._modes(best)
+            best = self._choose_components(self._try_mirrors(best), components)
+            recipe, modes = best.recipe, self._choose_modes(best)
         figures = self._calibration(best, modes)._asdict()
         return recipe, modes, figures | {"box_margins": self._margins(best)}
 
-    def _with_mirror(self, best: _Trial) -> _Trial:
+    def _try_mirrors(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
         found = [find_mirror(completed, axis) for axis in range(3)]
         mirrors = [each for each in found if is_symmetry(completed, each)]
         if not mirrors:
             return best
         mirrored = self._best(replace(best.recipe, mirror=each) for each in mirrors)
-        # Twice as many models to learn from are worth a little.
-        return mirrored if _is_enough(mirrored.scores, best.scores, _TOLERANCE) else best
+        # A mirror doubles the training data, so it may score slightly worse.
+        return mirrored if _is_good(mirrored.scores, best.scores, _TOLERANCE) else best
 
-    def _with_components(self, single: _Trial, wanted: int | None) -> _Trial:
+    def _choose_components(self, single: _Trial, wanted: int | None) -> _Trial:
         if wanted is not None:
             return self._try(replace(single.recipe, components=wanted))
         counts = range(2, _MOST_COMPONENTS + 1)
         tried = [single, *(self._try(replace(single.recipe, components=each)) for each in counts)]
-        return tried[_least_enough([each.scores for each in tried], _TOLERANCE)]
+        return tried[_first_good([each.scores for each in tried], _TOLERANCE)]
 
-    def _modes(self, trial: _Trial) -> int:
+    def _choose_modes(self, trial: _Trial) -> int:
         full = self._models.rows[0].size
         counts = [*(count for count in _MODES if count < full), full]
-        parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
-        return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
+        parts = [[_truncate(each, count) for each in trial.learned] for count in counts]
+        return int(counts[_first_good([self._scores(each) for each in parts], _MODE_TOLERANCE)])
 
     def _calibration(self, trial: _Trial, modes: int | None) -> ShapeCalibration:
         held_out = [
-            (self._models.rows[self._folds == fold][:_MOST_CALIBRATED], _truncated(mixture, modes))
+            (self._models.rows[self._folds == fold][:_MOST_CALIBRATED], _truncate(mixture, modes))
             for fold, mixture in enumerate(trial.learned)
         ]
         sigma = _RESOLUTION * self._models.size
@@ -204,7 +200,7 @@ class _CrossValidation:
         excesses = np.empty((len(rows), 2, 3))
         for fold, mixture in enumerate(trial.learned):
             held_out = self._folds == fold
-            excesses[held_out] = excesses_of(rows[held_out], mixture)
+            excesses[held_out] = box_excesses(rows[held_out], mixture)
         return learn_margins(rows, excesses)
 
     def _best(self, recipes: Iterable[_Recipe]) -> _Trial:
@@ -224,9 +220,9 @@ class _CrossValidation:
 def learn_parts(
     examples: Sequence[Example], category: str, components: int | None
 ) -> dict[str, Any]:
-    """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
+    """Learn the fields of a shape model except category, axis and unit; see `ShapeModel.learn`."""
     require_counts(components=1 if components is None else components)
-    ids, rows, training = tabulated(examples, category)
+    ids, rows, training = tabulate(examples, category)
     if (components or 1) > len(rows):
         what = f"{components} are more than the {len(rows)} models"
         raise InputError(what, where="components")
@@ -250,7 +246,7 @@ def learn_parts(
 
 
 def _vectors(rows: FloatArray, mirror: Mirror | None) -> Vectors:
-    """Models as vectors, beside each its mirror image of the same weight."""
+    """Flatten models to vectors; with a mirror, add mirror images and halve the weights."""
     weight = 1.0
     if mirror is not None:
         rows = np.concatenate([rows, mirrored(rows, mirror)])
@@ -267,18 +263,18 @@ def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
     tries = []
     for seed in range(_CLUSTERINGS):
         with warnings.catch_warnings():
-            # Of clusters without vectors, and of vectors that are all the same.
+            # For empty clusters and for identical vectors.
             warnings.simplefilter("ignore", UserWarning)
             warnings.simplefilter("ignore", RuntimeWarning)
             centres, labels = kmeans2(coefficients, count, minit="++", seed=seed)
         tries.append((float(((coefficients - centres[labels]) ** 2).sum()), seed, labels))
     labels = min(tries)[2].astype(np.int64)
-    labels[np.arange(count) % len(labels)] = np.arange(count)  # none is left out
+    labels[np.arange(count) % len(labels)] = np.arange(count)  # no cluster is empty
     return np.asarray(labels)
 
 
-def _truncated(mixture: Gaussians, modes: int | None) -> Gaussians:
-    """The mixture that is left of another one when only some modes are kept."""
+def _truncate(mixture: Gaussians, modes: int | None) -> Gaussians:
+    """Reduce a mixture to a number of modes."""
     parts = [
         component_of_covariance(mean.reshape(-1, 3), covariance, modes=modes).covariance
         for mean, covariance in zip(mixture.means, mixture.covariances, strict=True)
@@ -286,13 +282,13 @@ def _truncated(mixture: Gaussians, modes: int | None) -> Gaussians:
     return Gaussians(mixture.weights, mixture.means, np.array(parts))
 
 
-def _least_enough(scores: Sequence[FloatArray], tolerance: float) -> int:
-    """The first that makes the models about as likely as any other."""
+def _first_good(scores: Sequence[FloatArray], tolerance: float) -> int:
+    """Index of the first scores that are about as good as the best; see `_is_good`."""
     best = max(scores, key=np.sum)
-    return next(row for row, each in enumerate(scores) if _is_enough(each, best, tolerance))
+    return next(row for row, each in enumerate(scores) if _is_good(each, best, tolerance))
 
 
-def _is_enough(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:
-    """True if models are less likely by no more than a tolerance or the standard error."""
+def _is_good(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:
+    """True if the mean loss is at most a tolerance or its standard error."""
     losses = best - scores
     return float(losses.mean()) <= max(tolerance, float(losses.std()) / math.sqrt(len(losses)))

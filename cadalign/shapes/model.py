@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ShapeModel:
-    """The shapes of a category: keypoints and bounding box, jointly Gaussian, or a mixture.
+    """Shapes of a category: a Gaussian, or a mixture, over keypoints and bounding box.
 
-    `ShapeModel.learn` and `ShapeModel.from_dataset` learn one from models, `ShapeModel.from_basis`
-    makes one from given numbers, `ShapeModel.open` reads one that `ShapeModel.save` wrote.
+    `ShapeModel.learn` and `ShapeModel.from_dataset` learn a shape model from CAD models,
+    `ShapeModel.from_basis` makes one from a mean and modes, `ShapeModel.open` reads a file.
 
     Raises
     ------
     InputError
-        If the parts don't agree in their number of keypoints, or the weights don't sum to 1.
+        If the numbers of keypoints don't match, or the weights don't sum to 1.
 
     Examples
     --------
@@ -66,28 +66,27 @@ class ShapeModel:
     """Semantic ids or names of the m keypoints, in the order of the components' rows; sorted if
     they were learned."""
     components: tuple[ShapeComponent, ...]
-    """The mixture; weights sum to 1."""
+    """Components of the mixture; their weights sum to 1."""
     has_box: bool = True
-    """Whether the rows of the box were learned or given; otherwise the box of an estimate is the
-    extent of all its keypoints."""
+    """True if the box was learned or given. Otherwise the box of an estimate is the extent of its
+    keypoints."""
     up_axis: Literal["x", "y", "z"] | None = None
-    """The model axis that points up, None where it is not known."""
+    """Model axis that points up, None if unknown."""
     training: TrainingShapes | None = None
-    """The models that it was learned from."""
+    """Models that the shape model was learned from."""
     unit: str = "model units"
     """Unit of lengths: "diagonal" for KeypointNet's models, "m" for metres."""
     inflation: float = 1.0
-    """Factor of the shapes' standard deviations in stated covariances: the one at which, while it
-    was learned, the regions of held-out models held the truth as often as they said. Estimates
-    don't depend on it."""
+    """Factor of the shape's standard deviations in the covariances of results, calibrated on
+    held-out models. Estimates don't depend on it."""
     degrees_of_freedom: float | None = None
-    """Tails of the t distribution that the errors of estimates follow, found likewise: more than 2,
-    None if they are Gaussian. Covariances are those of the errors in any case."""
+    """Degrees of freedom, more than 2, of the t distribution of the errors, calibrated likewise;
+    None for Gaussian errors. Covariances are the errors' covariances in both cases."""
     box_margins: BoxMargins | None = None
-    """Where the faces of boxes are beyond the keypoints; None if that is not known, and boxes are
-    the learned ones, enlarged by the given keypoints."""
+    """Distances of the box's faces from the keypoints. If None, the learned box is enlarged to hold
+    the given keypoints."""
     few_keypoints: FewKeypoints | None = None
-    """Decrease of the inflation where few keypoints are given, found likewise; None for none."""
+    """Decrease of the inflation for few given keypoints, calibrated likewise; None for none."""
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
@@ -130,29 +129,29 @@ class ShapeModel:
         unit: str = "model units",
         components: int | None = None,
     ) -> ShapeModel:
-        """Learn the shapes of a category from models of it.
+        """Learn a shape model from models of a category.
 
-        Models may lack keypoints; these are completed by expectation maximisation. The numbers of
-        Gaussians and of modes are chosen by the likelihood of models that were held out, and so is
-        whether the category has a mirror symmetry: the mirrored models are then learned from, too.
-        Ids that few models have keep wide standard deviations.
+        Models may lack keypoints; expectation maximisation completes them. The likelihood of
+        held-out models chooses the numbers of Gaussians and modes. It also decides whether the
+        category has a mirror symmetry; if so, the mirrored models are learned from, too. Keypoints
+        that few models have keep large standard deviations.
 
         Parameters
         ----------
         models : iterable of Example
-            At least 4. If less than half of them have bounds, the boxes are those of the keypoints.
+            At least 4. If fewer than half have bounds, the extents of the keypoints are used.
         category, up_axis, unit
             See `ShapeModel`.
         components : int, optional
-            Number of Gaussians; each costs a search of its own when an image is aligned.
+            Number of Gaussians. Aligning an image takes one search for each.
 
         Raises
         ------
         InputError
-            If there are too few models, a model id occurs twice, the models' ids are partly numbers
-            and partly names, or an option is out of range.
+            If there are too few models, a model id occurs twice, keypoint ids are numbers in some
+            models and names in others, or an option is out of range.
         """
-        from cadalign.shapes.learning import learn_parts  # an estimate learns nothing
+        from cadalign.shapes.learning import learn_parts  # not needed for estimates
 
         learned = learn_parts(list(models), category, components)
         return cls(category=category, up_axis=up_axis, unit=unit, **learned)
@@ -167,18 +166,18 @@ class ShapeModel:
         meshes: bool = True,
         components: int | None = None,
     ) -> ShapeModel:
-        """Learn the shapes of a category of `cadalign.datasets.KeypointNet`.
+        """Learn a shape model from a category of `cadalign.datasets.KeypointNet`.
 
         Parameters
         ----------
         dataset : KeypointNet
         category : str
-            Its name or synset id.
+            Name or synset id.
         split : str, optional
             Learn from the models of this split only.
         meshes : bool
-            Whether to read the meshes for the bounding boxes, where at least half of the models
-            have one; otherwise the boxes are those of the keypoints.
+            Read the bounding boxes from the meshes if at least half of the models have one.
+            Otherwise the extents of the keypoints are used.
         components
             See `ShapeModel.learn`.
 
@@ -187,7 +186,7 @@ class ShapeModel:
         InputError
             If category or split is unknown, or the category has too few models.
         """
-        from cadalign.shapes.examples import examples_of  # an estimate learns nothing
+        from cadalign.shapes.examples import examples_of  # not needed for estimates
 
         models = dataset.subset(categories=[category], split=split)[category]
         return cls.learn(
@@ -217,19 +216,19 @@ class ShapeModel:
         Parameters
         ----------
         mean : (m, 3) float
-            The keypoints of the mean shape.
+            Keypoints of the mean shape.
         modes : (K, m, 3) float
-            Directions of deformation; the mean times an axis' unit vector is the size along it.
+            Directions of deformation; ``mean * [1, 0, 0]`` is a stretch along x.
         deviations : (K,) float
             Standard deviations of their coefficients, 0 or more.
         ids : (m,) int or str, optional
             Semantic ids or names of the keypoints; by default ``0 ... m - 1``.
         box : (2, 3) float, optional
-            Least and greatest corner of the mean shape's bounding box. With each mode it moves by
-            the shift and the stretch along each axis that fit the keypoints' motion best. By
-            default the box of an estimate is the extent of all its keypoints.
+            Least and greatest corner of the mean shape's bounding box. Each mode shifts and
+            stretches the box along its axes by the best fit to the keypoints' motion. By default
+            the box of an estimate is the extent of its keypoints.
         residual_sigma : float
-            Standard deviation per coordinate of what the modes leave [model units].
+            Standard deviation per coordinate of the residual from the modes [model units].
         category, up_axis, unit
             See `ShapeModel`.
 
@@ -265,7 +264,7 @@ class ShapeModel:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> ShapeModel:
-        """Read a file that `ShapeModel.save` wrote.
+        """Read a file written by `ShapeModel.save`.
 
         Raises
         ------
@@ -275,7 +274,7 @@ class ShapeModel:
         return read_shape(path, cls)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model to a file atomically; raises DataError on failure."""
+        """Write the shape model to a file atomically; raises DataError on failure."""
         write_shape(path, self)
 
     def __repr__(self) -> str:
@@ -286,17 +285,17 @@ class ShapeModel:
 
     @property
     def mean(self) -> FloatArray:
-        """Mean of the mixture: keypoints, then the box's corners, (m + 2, 3) float."""
+        """Mean of the mixture: keypoints, then the box's two corners, (m + 2, 3) float."""
         return np.asarray(sum(each.weight * each.mean for each in self.components))
 
     @cached_property
     def gaussians(self) -> Gaussians:
-        """The components as arrays: means (G, m + 2, 3), covariances of the stacked rows."""
+        """The components as arrays: means (G, m + 2, 3), and covariances of the stacked rows."""
         parts = [(each.weight, each.mean, each.covariance) for each in self.components]
         return Gaussians(*map(np.array, zip(*parts, strict=True)))
 
     def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:
-        """Rows of the keypoints that have these ids, (n,) int.
+        """Rows of the keypoints with the given ids, (n,) int.
 
         Raises
         ------
@@ -315,7 +314,7 @@ class ShapeModel:
         return np.array([row_of[label] for label in wanted], dtype=np.int64)
 
     def nearest(self, points_3d: npt.ArrayLike) -> int:
-        """Find the row in ``training`` of the model whose keypoints are nearest to given ones.
+        """Row in ``training`` of the model with the nearest keypoints.
 
         Parameters
         ----------
@@ -328,11 +327,11 @@ class ShapeModel:
             If there are no training models, a shape is wrong, or a value is NaN or infinite.
         """
         if self.training is None or not len(self.training):
-            raise InputError("no training models are known", where=self.category)
+            raise InputError("the shape model has no training models", where=self.category)
         points = as_floats(points_3d, name="points_3d", shape=(len(self.ids), 3))
         known = self.training.points_3d
         squares = ((known.astype(np.float64) - points) ** 2).sum(axis=2)
-        # Two objects of the category are this far apart in a keypoint on average.
+        # Expected squared distance between two objects of the category, for missing keypoints.
         expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
         distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
         return int(np.argmin(distances))

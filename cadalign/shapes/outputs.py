@@ -1,7 +1,7 @@
 """Files of shape models.
 
-A file is a sealed MessagePack document; see `cadalign.io.files` for the header. It holds the
-fields of `cadalign.ShapeModel` and of its parts, arrays as little-endian numbers with their shape.
+A file is a sealed MessagePack document; see `cadalign.io.files` for the header. It holds the fields
+of `cadalign.ShapeModel` and its parts. Arrays are stored as shape and little-endian numbers.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ SEAL = Seal(
     noun="shape file",
     fix="learn it with: cadalign shape learn",
 )
-_MAX_BYTES = 1 << 30  # of thousands of models with hundreds of keypoints each
+_MAX_BYTES = 1 << 30  # enough for thousands of models with hundreds of keypoints each
 
 
 class _Array(Document):
-    """Little-endian numbers in C order."""
+    """An array of little-endian numbers in C order."""
 
     shape: Annotated[list[Count], Meta(max_length=3)]
     data: bytes
@@ -41,8 +41,8 @@ def write_shape(path: str | os.PathLike[str], model: Any) -> None:
     """Write a shape model's file atomically."""
     document = {each.name: getattr(model, each.name) for each in fields(model)}
     try:
-        content = msgspec.msgpack.encode(document, enc_hook=_written)
-    except (UnicodeEncodeError, OverflowError) as error:  # of a name, of a number as an id
+        content = msgspec.msgpack.encode(document, enc_hook=_encode)
+    except (UnicodeEncodeError, OverflowError) as error:  # a name, an integer id
         raise InputError(f"cannot be saved ({error})", where=model.category) from None
     SEAL.write(as_path(path), content)
 
@@ -53,27 +53,27 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
     payload = SEAL.unwrap(read_bytes(file, most=_MAX_BYTES), str(file))
     try:
         document = msgspec.msgpack.decode(payload)
-        return msgspec.convert(document, kind, dec_hook=_read)
+        return msgspec.convert(document, kind, dec_hook=_decode)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise SEAL.error(f"is invalid: {str(error)[:200]}", str(file)) from None
 
 
-def _written(value: Any) -> Any:
+def _encode(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     little = value.astype(value.dtype.newbyteorder("<"))
     return _Array(list(value.shape), little.tobytes())
 
 
-def _read(kind: Any, value: Any) -> Any:
+def _decode(kind: Any, value: Any) -> Any:
     try:
         if kind is Path:
             return Path(msgspec.convert(value, PathText))
         array = msgspec.convert(value, _Array)
     except msgspec.ValidationError as error:
-        raise ValueError(str(error)) from None  # to which the library adds the place
+        raise ValueError(str(error)) from None  # msgspec adds the field's path
     dtype = np.dtype(get_args(get_args(kind)[1])[0]).newbyteorder("<")
     numbers = np.frombuffer(array.data, dtype=dtype) if array.data else np.empty(0, dtype=dtype)
     if math.prod(array.shape) != len(numbers):
-        raise InputError(f"{len(numbers)} numbers are not of the shape {array.shape}")
+        raise InputError(f"{len(numbers)} numbers do not fit the shape {array.shape}")
     return numbers.reshape(array.shape).astype(dtype.newbyteorder("="))

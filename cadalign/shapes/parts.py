@@ -1,4 +1,4 @@
-"""Parts of a shape model: components, training, box, and the tails of its errors."""
+"""Parts of a shape model: components, training models, box margins and error statistics."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ KeypointId = int | str
 """A keypoint's semantic id or name."""
 
 BOX_ROWS = 2  # the box's least and greatest corner, after the keypoints
-FEW = 6  # keypoints with which the inflation is least
+FEW = 6  # number of keypoints down to which the inflation decreases
 OUTWARD = np.array([[-1.0], [1.0]])
-"""Signs of the directions out of a box, at its least and greatest faces."""
+"""Signs of the outward directions at a box's least and greatest faces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class ShapeComponent:
     not in (0, 1].
     """
 
-    weight: float  # its share in the mixture
+    weight: float  # in the mixture
     mean: FloatArray
     """(m + 2, 3), the m keypoints, then the least and the greatest corner of the bounding box
     [model units]."""
@@ -42,7 +42,7 @@ class ShapeComponent:
     """(K, m + 2, 3), directions of deformation, one standard deviation long, the longest first
     [model units]."""
     residual_sigma: float
-    """Standard deviation, per coordinate, of what the modes leave [model units]."""
+    """Standard deviation of the residual per coordinate [model units]."""
 
     def __post_init__(self) -> None:
         mean = as_floats(self.mean, name="mean", shape=(None, 3))
@@ -70,22 +70,22 @@ class ShapeComponent:
 
     @property
     def variance(self) -> FloatArray:
-        """Sum of the rows' variances along each mode, (K,) float [model units squared]."""
+        """Sum of all rows' variances by mode, (K,) float [model units squared]."""
         return np.asarray((self.modes**2).sum(axis=(1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingShapes:
-    """The keypoints of the models that a shape model was learned from.
+    """Keypoints of the models that a shape model was learned from.
 
     Raises InputError if lengths or shapes don't match, or a coordinate is infinite.
     """
 
     model_ids: tuple[str, ...]  # one for each model
     points_3d: npt.NDArray[np.float32]
-    """(N, m, 3) float32, their keypoints in the order of the shape model's ids [model units]; NaN
-    where a model lacks one."""
-    mesh_paths: tuple[Path | None, ...]  # their meshes
+    """(N, m, 3) float32, keypoints in the order of the shape model's ids [model units]; NaN if
+    missing."""
+    mesh_paths: tuple[Path | None, ...]  # one for each model
 
     def __post_init__(self) -> None:
         points = np.ascontiguousarray(self.points_3d, dtype=np.float32)
@@ -113,19 +113,18 @@ class TrainingShapes:
 
 @dataclass(frozen=True, eq=False)
 class BoxMargins:
-    """Distances between the faces of objects' boxes, their keypoints, and linear boxes.
+    """Correction of the linear box, which the Gaussian estimates, by the given keypoints.
 
-    Raises InputError if a shape is wrong, or a value is NaN, infinite or, of the tolerances,
-    negative.
+    Raises InputError if a shape is wrong, a value is NaN or infinite, or a tolerance is negative.
 
     Examples
     --------
-    A face a little beyond the keypoints is where these end; one that is far beyond is another
-    part's:
+    Faces within the tolerance of the keypoints are moved to them; faces far beyond belong to other
+    parts and stay:
 
     >>> rule = BoxMargins(np.zeros((2, 3)), np.full((2, 3), 0.1))
-    >>> seen = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    >>> rule.bounds(np.array([[-0.05, 0.0, -0.5], [1.0, 1.05, 1.0]]), seen).tolist()
+    >>> points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    >>> rule.bounds(np.array([[-0.05, 0.0, -0.5], [1.0, 1.05, 1.0]]), points).tolist()
     [[-0.0, -0.0, -0.5], [1.0, 1.0, 1.0]]
     """
 
@@ -133,8 +132,8 @@ class BoxMargins:
     """(2, 3), median distance of the least and the greatest face along x, y, z beyond the outermost
     keypoint [model units]."""
     tolerances: FloatArray
-    """(2, 3), how far beyond the true face the linear box, given all keypoints, lies in one
-    held-out object of twenty [model units]."""
+    """(2, 3), 95th percentile of the distance of the linear box, from all keypoints, beyond the
+    true face, over held-out models [model units]."""
 
     def __post_init__(self) -> None:
         for name in ("margins", "tolerances"):
@@ -143,9 +142,9 @@ class BoxMargins:
         if (self.tolerances < 0).any():
             raise InputError("a distance is negative", where="tolerances")
 
-    def bounds(self, linear: FloatArray, seen: FloatArray) -> FloatArray:
-        """The box (2, 3) of an object, from the linear box and the given keypoints (n, 3)."""
-        reached = OUTWARD * np.array([seen.min(axis=0), seen.max(axis=0)]) + self.margins
+    def bounds(self, linear: FloatArray, points: FloatArray) -> FloatArray:
+        """Box (2, 3) of an object, from the linear box (2, 3) and the given keypoints (n, 3)."""
+        reached = OUTWARD * np.array([points.min(axis=0), points.max(axis=0)]) + self.margins
         outward = OUTWARD * linear
         return np.asarray(OUTWARD * np.where(outward > reached + self.tolerances, outward, reached))
 
@@ -153,10 +152,10 @@ class BoxMargins:
 def probability_within(
     squares: npt.ArrayLike, dimension: int, degrees_of_freedom: float | None = None
 ) -> Any:
-    """Probability of the region about an estimate that reaches as far as given errors.
+    """Probability that errors are smaller than given ones.
 
-    ``squares`` are squared errors of ``dimension`` coordinates in stated standard deviations;
-    ``degrees_of_freedom`` are more than 2, None for Gaussian errors.
+    ``squares`` are squared errors of ``dimension`` coordinates, in standard deviations. Errors
+    follow a t distribution with ``degrees_of_freedom`` > 2, None for Gaussian errors.
 
     Examples
     --------
@@ -174,7 +173,7 @@ def probability_within(
 def radius_of(
     probability: float, dimension: int = 1, degrees_of_freedom: float | None = None
 ) -> float:
-    """Radius, in stated deviations, of the region that holds the truth with a probability.
+    """Radius, in standard deviations, of the region that holds the truth with a probability.
 
     The inverse of `probability_within`.
 
@@ -193,10 +192,10 @@ def radius_of(
 
 @dataclass(frozen=True)
 class FewKeypoints:
-    """Share of the inflation that is left where few keypoints are given.
+    """Decrease of the inflation for few given keypoints.
 
-    The directions of shape that many keypoints determine vary little, and their variances are the
-    least well learned; where few are given, errors are those along the main modes.
+    With few keypoints, errors lie mainly along the main modes, whose variances are learned best, so
+    that less inflation is needed.
 
     Raises InputError if a number is out of range.
 
@@ -206,8 +205,8 @@ class FewKeypoints:
     0.81
     """
 
-    typical: float  # number of keypoints from which on the inflation is the whole one
-    share: float  # its share with `FEW` keypoints or less, in (0, 1]
+    typical: float  # number of keypoints from which the whole inflation applies
+    share: float  # share of the inflation with at most `FEW` keypoints, in (0, 1]
 
     def __post_init__(self) -> None:
         for name, least, most in (("typical", FEW, math.inf), ("share", 0, 1)):
@@ -218,18 +217,18 @@ class FewKeypoints:
             object.__setattr__(self, name, float(value))
 
     def share_of(self, count: float) -> float:
-        """Share of the inflation with a number of keypoints."""
+        """Share of the inflation for a number of given keypoints."""
         position = math.log(max(count, FEW) / FEW) / math.log(self.typical / FEW)
         return math.pow(self.share, 1 - min(position, 1.0))
 
 
 def inflation_with(count: float, inflation: float, few_keypoints: FewKeypoints | None) -> float:
-    """Inflation where a number of keypoints is given."""
+    """Inflation for a number of given keypoints."""
     return inflation if few_keypoints is None else inflation * few_keypoints.share_of(count)
 
 
 def check_text(text: object, where: str) -> str:
-    """Check a text, of NumPy or not: what is none could be saved, but not read back."""
+    """Check and convert a text; other types could be saved, but not read back."""
     if not isinstance(text, str):
         what = f"expected a text, got {type(text).__name__} {quote(text)}"
         raise InputError(what, where=where, fix="give str(...) of it")
@@ -237,13 +236,13 @@ def check_text(text: object, where: str) -> str:
 
 
 def check_axis(axis: object, where: str) -> None:
-    """Refuse what is not the name of an axis."""
+    """Raise an InputError if a value is not "x", "y" or "z"."""
     if not isinstance(axis, str) or axis not in ("x", "y", "z"):
-        raise InputError(f"{quote(axis)} is no axis", where=where, fix="give x, y or z")
+        raise InputError(f"{quote(axis)} is not an axis", where=where, fix="give x, y or z")
 
 
-def checked_box(box: npt.ArrayLike, where: str) -> FloatArray:
-    """The least and the greatest corner of a box (2, 3); InputError if it is upside down."""
+def check_box(box: npt.ArrayLike, where: str) -> FloatArray:
+    """Check least and greatest corners (2, 3); raises InputError if they are not in order."""
     corners = as_floats(box, name=where, shape=(2, 3))
     if (corners[0] > corners[1]).any():
         what = f"the least corner {corners[0].tolist()} exceeds {corners[1].tolist()}"
@@ -252,7 +251,7 @@ def checked_box(box: npt.ArrayLike, where: str) -> FloatArray:
 
 
 def check_ids(ids: Sequence[KeypointId], where: str) -> tuple[KeypointId, ...]:
-    """Check a list of keypoints' ids or names: whole numbers or texts, not both, none twice."""
+    """Check keypoint ids: whole numbers or texts, of one kind, each once."""
     found: list[KeypointId] = []
     for row, label in enumerate(ids):
         if isinstance(label, int | np.integer) and not isinstance(label, bool | np.bool_):

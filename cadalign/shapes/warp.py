@@ -1,10 +1,10 @@
-"""Warping of meshes, such that their keypoints come to given places.
+"""Warping of meshes by target positions of their keypoints.
 
-A stretch along the axes carries the mesh as a whole; what it leaves is interpolated by radial basis
-functions: the thin plate spline of three dimensions, whose kernel is r (Duchon, "Splines minimizing
-rotation-invariant semi-norms in Sobolev spaces", 1977), its tip rounded to a multiquadric (Hardy,
-"Multiquadric equations of topography and other irregular surfaces", 1971). Kernels of faster growth
-overshoot and fold the mesh where near keypoints move apart.
+The mesh is stretched along the axes; radial basis functions interpolate the keypoints' remaining
+displacements. The kernel is r, the thin plate spline in three dimensions (Duchon, "Splines
+minimizing rotation-invariant semi-norms in Sobolev spaces", 1977), rounded near 0 to a multiquadric
+(Hardy, "Multiquadric equations of topography and other irregular surfaces", 1971). Kernels that
+grow faster overshoot and fold the mesh between near keypoints that move apart.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import bounds_corners
 from cadalign.geometry.mesh import Mesh
-from cadalign.shapes.parts import checked_box
+from cadalign.shapes.parts import check_box
 
 # Lengths relative to the diagonal of mesh and keypoints.
-_ROUNDING = 0.02  # of the kernel's tip, at most
-_MARGIN = 0.25  # from the mesh to the corners around it, which follow the stretch alone
+_ROUNDING = 0.02  # largest radius of the kernel's rounding
+_MARGIN = 0.25  # distance of the corners around the mesh, which follow the stretch alone
 _COINCIDENT = 1e-6
 
 
 def warp_mesh(
     mesh: Mesh, source: npt.ArrayLike, target: npt.ArrayLike, *, bounds: npt.ArrayLike
 ) -> Mesh:
-    """Warp a mesh such that its keypoints come to given places.
+    """Warp a mesh by moving its keypoints to target positions.
 
-    Keypoints may be coplanar, or few. For coincident ones the mean of the targets counts; otherwise
-    the warp is exact at the keypoints. Far from all keypoints it is a stretch along the axes.
+    The warp is exact at the keypoints; coincident keypoints move to the mean of their targets. Few
+    or coplanar keypoints suffice. Far from all keypoints the warp is a stretch along the axes.
 
     Parameters
     ----------
@@ -41,14 +41,14 @@ def warp_mesh(
     source : (n, 3) float
         Keypoints of the mesh [model units].
     target : (n, 3) float
-        The places that they come to [model units].
+        Target positions [model units].
     bounds : (2, 3) float
-        Least and greatest corner of the box that the mesh shall about fill.
+        Least and greatest corner of the target bounding box, which is filled approximately.
 
     Returns
     -------
     Mesh
-        With the same faces and colours.
+        The warped mesh, with the same faces and colours.
 
     Raises
     ------
@@ -67,16 +67,17 @@ def warp_mesh(
     targets = as_floats(target, name="target", shape=(len(places), 3))
     if not len(places):
         raise InputError("no keypoints", where="source")
-    corners = checked_box(bounds, "bounds")
+    corners = check_box(bounds, "bounds")
     warp = linear_warp(mesh.vertices, mesh.bounds, places)
     return replace(mesh, vertices=warp.apply(targets, corners))
 
 
 class LinearWarp(NamedTuple):
-    """A warp of p points as a linear map of n keypoints' places and the box to fill.
+    """Warp of p points as a linear function of n keypoints' targets and the target box.
 
-    ``by_keypoints`` (p, n) holds for every axis alike, ``by_least`` and ``by_greatest`` (p, 3) are
-    the weights of the box's corners along each axis, ``constant`` (p, 3) holds for all places.
+    ``by_keypoints`` (p, n) are the weights of the targets along every axis, ``by_least`` and
+    ``by_greatest`` (p, 3) the weights of the box's corners along each axis. ``constant`` (p, 3) is
+    added.
     """
 
     by_keypoints: FloatArray
@@ -85,19 +86,19 @@ class LinearWarp(NamedTuple):
     constant: FloatArray
 
     def apply(self, target: FloatArray, bounds: FloatArray) -> FloatArray:
-        """The points (p, 3) where the keypoints come to ``target`` (n, 3), the box to a box."""
+        """Warped points (p, 3) for keypoints' targets (n, 3) and a target box (2, 3)."""
         return self.constant + self.derivative(target, bounds)
 
     def derivative(self, target: FloatArray, bounds: FloatArray) -> FloatArray:
-        """Displacements (p, 3) by those of the keypoints (n, 3) and of the box's corners (2, 3)."""
+        """Displacements (p, 3) for displacements of targets (n, 3) and box corners (2, 3)."""
         of_box = self.by_least * bounds[0] + self.by_greatest * bounds[1]
         return np.asarray(self.by_keypoints @ target + of_box)
 
 
 def linear_warp(points: FloatArray, box: FloatArray, source: FloatArray) -> LinearWarp:
-    """The warp of points (p, 3) of a mesh, with its ``box`` (2, 3) and keypoints (n, 3)."""
+    """Make the warp of points (p, 3) of a mesh with bounds ``box`` (2, 3) and keypoints (n, 3)."""
     diagonal = float(np.linalg.norm(np.ptp(np.vstack([box, source]), axis=0))) or 1.0
-    # Of coincident keypoints there is one place, which takes the mean of their targets.
+    # Coincident keypoints are merged and take the mean of their targets.
     gaps = np.linalg.norm(source[:, None] - source, axis=2)
     first = (gaps <= _COINCIDENT * diagonal).argmax(axis=1)
     same = np.unique(first)[:, None] == first
@@ -121,11 +122,11 @@ def linear_warp(points: FloatArray, box: FloatArray, source: FloatArray) -> Line
 def _weights(
     points: FloatArray, box: FloatArray, places: FloatArray, diagonal: float
 ) -> FloatArray:
-    """Shares (p, n) of the keypoints' displacements in those of points."""
+    """Interpolation weights (p, n) of the keypoints' displacements at points (p, 3)."""
     from scipy.interpolate import RBFInterpolator
     from scipy.spatial.distance import pdist
 
-    # The kernel's tip is rounded less where keypoints are near each other.
+    # The kernel is rounded less if keypoints are near each other.
     rounding = min(_ROUNDING * diagonal, float(pdist(places).min(initial=diagonal)))
     everything = np.vstack([box, places])
     margin = _MARGIN * diagonal

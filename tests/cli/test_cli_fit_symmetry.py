@@ -68,4 +68,4 @@ def test_what_is_no_symmetry_is_refused_by_file_and_field(
     path = with_symmetry(write_observation(tmp_path), {"axis": [0, 1, 0], "fold": -1})
     line = refusal_line(capsys, "fit", path)
     assert "box.json" in line
-    assert "symmetry.fold: '-1' is no number of rotations" in line
+    assert "symmetry.fold: '-1' is not a number of rotations" in line

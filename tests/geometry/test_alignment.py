@@ -1,4 +1,4 @@
-"""The alignment: its algebra, what it refuses, and its way through dictionaries."""
+"""Alignment: algebra, validation and dictionaries."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def rotation_matrix(vector: list[float]) -> np.ndarray:
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-# Turns of every size, those near none and near half a turn on purpose.
+# Rotations of every angle, with samples near 0 and 180 degrees.
 ANGLES = st.sampled_from([0.0, 1e-12, 1e-7, 1e-3, np.pi - 1e-7, np.pi]) | st.floats(0.0, np.pi)
 AXES = st.sampled_from([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]) | st.integers(0, 2**32 - 1).map(
     lambda seed: (v := np.random.default_rng(seed).standard_normal(3)) / np.linalg.norm(v)
@@ -45,7 +45,7 @@ def test_apply_is_rotation_times_stretch_plus_translation(alignment: Alignment) 
 
 
 @given(alignment=ALIGNMENTS)
-def test_matrix_does_what_apply_does(alignment: Alignment) -> None:
+def test_matrix_agrees_with_apply(alignment: Alignment) -> None:
     homogeneous = np.column_stack([POINTS, np.ones(len(POINTS))])
     moved = homogeneous @ alignment.cam_from_model.T
     np.testing.assert_allclose(moved[:, :3], alignment.apply(POINTS), rtol=0, atol=1e-11)
@@ -54,19 +54,19 @@ def test_matrix_does_what_apply_does(alignment: Alignment) -> None:
 
 
 @given(alignment=ALIGNMENTS)
-def test_inverse_undoes_apply_on_either_side(alignment: Alignment) -> None:
+def test_inverse_inverts_apply_on_both_sides(alignment: Alignment) -> None:
     np.testing.assert_allclose(alignment.inverse(alignment.apply(POINTS)), POINTS, atol=1e-11)
     np.testing.assert_allclose(alignment.apply(alignment.inverse(POINTS)), POINTS, atol=1e-11)
 
 
 @given(alignment=ALIGNMENTS)
-def test_from_dict_undoes_to_dict_exactly_even_through_json(alignment: Alignment) -> None:
+def test_from_dict_inverts_to_dict_exactly_also_through_json(alignment: Alignment) -> None:
     again = Alignment.from_dict(json.loads(json.dumps(alignment.to_dict())))
     assert again == alignment
     assert hash(again) == hash(alignment)
 
 
-def test_equality_looks_at_every_part() -> None:
+def test_equality_compares_every_field() -> None:
     base = Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
     assert base == Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
     assert base != Alignment(np.eye(3), [0, 0, 4], [1, 2, 3.1])
@@ -75,7 +75,7 @@ def test_equality_looks_at_every_part() -> None:
     assert base != "alignment"
 
 
-def test_arrays_cannot_be_written_and_are_not_the_callers() -> None:
+def test_arrays_are_read_only_copies() -> None:
     translation = np.array([0.0, 0.0, 4.0])
     alignment = Alignment(np.eye(3), translation, np.ones(3))
     translation[2] = 5.0
@@ -92,7 +92,7 @@ def test_copies_and_pickles_are_equal(duplicate: Any) -> None:
 
 
 @pytest.mark.parametrize("error", [1e-8, 1.3e-3, 4e-3])
-def test_nearly_rigid_rotations_are_made_exact(error: float) -> None:
+def test_nearly_rigid_rotations_are_orthonormalised(error: float) -> None:
     rng = np.random.default_rng(0)
     rotation = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
     nearly = rotation + rng.uniform(-error / 2, error / 2, (3, 3))

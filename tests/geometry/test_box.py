@@ -1,4 +1,4 @@
-"""The oriented box: its corners and edges, and the box of a stretched model."""
+"""Oriented boxes: corners, edges, and the box of a stretched model."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_corners_of_a_box_along_the_axes() -> None:
 
 
 @given(seed=SEEDS)
-def test_corners_are_the_models_corners_aligned(seed: int) -> None:
+def test_corners_are_the_aligned_corners_of_the_model(seed: int) -> None:
     rng = np.random.default_rng(seed)
     alignment, bounds = random_alignment(rng), random_bounds(rng)
     corners = np.array([[bounds[i >> k & 1, k] for k in range(3)] for i in range(8)])
@@ -55,7 +55,7 @@ def test_edges_are_twelve_four_along_each_axis(seed: int) -> None:
         np.testing.assert_allclose(edge, expected, rtol=0, atol=1e-12)
 
 
-def test_arrays_cannot_be_written_and_are_not_the_callers() -> None:
+def test_arrays_are_read_only_copies() -> None:
     center = np.zeros(3)
     box = Box(center, np.eye(3), np.ones(3))
     center[0] = 9.0
@@ -88,7 +88,7 @@ def test_box_refuses_wrong_values(arguments: tuple[Any, ...], text: str) -> None
         ([[0, 0, 0], [1, -1, 1]], "extents: [1.0, -1.0, 1.0] is negative"),
     ],
 )
-def test_from_model_refuses_what_are_no_bounds(bounds: Any, text: str) -> None:
+def test_from_model_refuses_wrong_bounds(bounds: Any, text: str) -> None:
     with pytest.raises(InputError) as caught:
         Box.from_model(bounds, Alignment.identity())
     assert str(caught.value) == text

@@ -1,4 +1,4 @@
-"""The camera: projection, lens, COLMAP's form, and what it refuses."""
+"""Camera: projection, lens, COLMAP's form and validation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cadalign.errors import InputError
 from cadalign.geometry.camera import COLMAP_PARAMS
 
 PLAIN = Camera(width=640, height=480, fx=500.0, fy=520.0, cx=310.5, cy=245.25)
-# Mild, and strong enough that forgetting a term would show; all of them invertible in the image.
+# Strong enough that a missing term shows; all can be inverted in the image.
 LENSES = {
     "none": (),
     "radial": (-0.2, 0.05, 0.0, 0.0),
@@ -26,7 +26,7 @@ LENSES = {
 }
 
 
-def camera_with(distortion: tuple[float, ...]) -> Camera:
+def make_camera(distortion: tuple[float, ...]) -> Camera:
     return Camera(640, 480, 500.0, 520.0, 310.5, 245.25, distortion)
 
 
@@ -41,7 +41,7 @@ def points_in_view(seed: int, count: int = 40) -> np.ndarray:
 @pytest.mark.parametrize("lens", LENSES)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_project_agrees_with_opencv(lens: str, seed: int) -> None:
-    camera = camera_with(LENSES[lens])
+    camera = make_camera(LENSES[lens])
     points = points_in_view(seed)
     coefficients = np.array(camera.distortion) if camera.distortion else None
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, coefficients)
@@ -51,8 +51,8 @@ def test_project_agrees_with_opencv(lens: str, seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_normalize_undoes_project(lens: str, seed: int) -> None:
-    camera = camera_with(LENSES[lens])
+def test_normalize_inverts_project(lens: str, seed: int) -> None:
+    camera = make_camera(LENSES[lens])
     points = points_in_view(seed)
     rays = camera.normalize(camera.project(points))
     np.testing.assert_allclose(rays, points[:, :2] / points[:, 2:], rtol=0, atol=1e-9)
@@ -60,7 +60,7 @@ def test_normalize_undoes_project(lens: str, seed: int) -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_distortion_jacobian_is_the_derivative_of_the_lens(lens: str) -> None:
-    camera = camera_with(LENSES[lens])
+    camera = make_camera(LENSES[lens])
     rays = np.random.default_rng(1).uniform(-0.6, 0.6, (30, 2))
     step = 1e-6
     columns = []
@@ -72,7 +72,7 @@ def test_distortion_jacobian_is_the_derivative_of_the_lens(lens: str) -> None:
     np.testing.assert_allclose(camera.distortion_jacobian(rays), expected, rtol=0, atol=1e-8)
 
 
-def test_x_goes_right_and_y_goes_down() -> None:
+def test_x_points_right_and_y_down() -> None:
     right, down = PLAIN.project([[1.0, 0.0, 5.0], [0.0, 1.0, 5.0]])
     assert right.tolist() == [PLAIN.cx + 100.0, PLAIN.cy]
     assert down.tolist() == [PLAIN.cx, PLAIN.cy + 104.0]
@@ -139,12 +139,12 @@ WRITTEN = {
 }
 
 
-def test_every_colmap_model_that_is_known_is_tested() -> None:
+def test_all_known_colmap_models_are_tested() -> None:
     assert set(PARAMS) == set(COLMAP_PARAMS)
 
 
 @pytest.mark.parametrize("model", PARAMS)
-def test_colmaps_models_are_read_and_written_as_the_smallest_that_holds_the_lens(
+def test_cameras_are_written_as_the_simplest_colmap_model(
     model: str,
 ) -> None:
     data = {"model": model, "width": 640, "height": 480, "params": PARAMS[model]}
@@ -274,7 +274,7 @@ def test_points_behind_the_camera_are_refused() -> None:
 
 
 def test_pixels_beyond_the_lens_are_refused() -> None:
-    camera = camera_with((-0.4, 0.0, 0.0, 0.0))
+    camera = make_camera((-0.4, 0.0, 0.0, 0.0))
     pixels = [[310.0, 245.0], [5000.0, 245.0]]
     with pytest.raises(InputError) as caught:
         camera.normalize(pixels)
@@ -298,7 +298,7 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
         ),
     ],
 )
-def test_project_refuses_what_are_no_points(points: Any, text: str) -> None:
+def test_project_refuses_wrong_points(points: Any, text: str) -> None:
     with pytest.raises(InputError) as caught:
         PLAIN.project(points)
     assert str(caught.value) == text
@@ -316,7 +316,7 @@ def test_camera_without_focal_length_has_its_principal_point_in_the_centre() -> 
     assert (given.cx, given.cy, given.distortion) == (300.0, 200.0, (0.1, 0.0, 0.0, 0.0))
 
 
-def test_focal_length_once_given_is_known() -> None:
+def test_with_focal_makes_the_focal_length_known() -> None:
     camera = Camera.without_focal(640, 480).with_focal(700)
     assert camera == Camera(640, 480, 700, 700, 319.5, 239.5)
     assert camera != Camera.without_focal(640, 480)
@@ -325,7 +325,7 @@ def test_focal_length_once_given_is_known() -> None:
 
 
 @pytest.mark.parametrize("use", ["project", "normalize"])
-def test_camera_without_focal_length_is_not_used_as_if_it_had_one(use: str) -> None:
+def test_camera_without_focal_length_refuses_projection(use: str) -> None:
     camera = Camera.without_focal(640, 480)
     points = [[0.0, 0.0, 2.0]] if use == "project" else [[3.0, 4.0]]
     with pytest.raises(InputError) as caught:
@@ -360,9 +360,9 @@ COEFFICIENTS = (0.1, -0.05, 0.001, 0.002, 0.03, 0.02, -0.01, 0.005, *(0.0,) * 6)
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
 @pytest.mark.parametrize("shape", [(-1,), (1, -1), (-1, 1)])
 @pytest.mark.parametrize("form", [tuple, list, np.asarray])
-def test_coefficients_are_read_as_opencv_returns_them(count: int, shape: Any, form: Any) -> None:
+def test_coefficients_have_the_shapes_of_opencv(count: int, shape: Any, form: Any) -> None:
     given = np.array(COEFFICIENTS[:count]).reshape(shape)
-    camera = camera_with(given if form is np.asarray else form(given.tolist()))
+    camera = make_camera(given if form is np.asarray else form(given.tolist()))
     assert camera.distortion == COEFFICIENTS[: min(count, 8)]
     matrix = camera.matrix.tolist()
     read = Camera.from_dict(
@@ -381,9 +381,9 @@ def test_coefficients_are_read_as_opencv_returns_them(count: int, shape: Any, fo
         (8, "camera.distortion: the thin prism terms s1 to s4, (0.01, 0.0, 0.0, 0.0), are not mo"),
     ],
 )
-def test_terms_that_are_not_modelled_are_refused_by_name(row: int, text: str) -> None:
+def test_unsupported_distortion_terms_are_refused_by_name(row: int, text: str) -> None:
     given = np.array(COEFFICIENTS)
     given[row] = 0.01
     with pytest.raises(InputError) as caught:
-        camera_with(tuple(given.tolist()))
+        make_camera(tuple(given.tolist()))
     assert str(caught.value).startswith(text)

@@ -1,4 +1,4 @@
-"""Pixel centres and axes of other programs: one module converts, and it agrees with renderings."""
+"""Conversions of pixel conventions and axes agree with renderings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SOURCES = Path(__file__).parents[2]
 
 
 def centroid(camera: Camera, center: np.ndarray) -> np.ndarray:
-    """The opacity-weighted mean pixel of a small square, rendered."""
+    """Opacity-weighted mean pixel of a rendered small square."""
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.036
     mesh = Mesh(center + corners, [[0, 1, 2], [0, 2, 3]])
     frame = RaycastRenderer().render(Scene(mesh), camera, Alignment.identity(), samples=256)
@@ -31,7 +31,7 @@ def image_centroid(weight: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("factor", [2, 3, 0.5])
-def test_a_resized_camera_renders_where_the_resized_pixels_are(factor: float) -> None:
+def test_a_resized_camera_renders_at_the_rescaled_pixels(factor: float) -> None:
     pixel = np.array([80.0, 60.0])
     center = 3.0 * np.append(CAMERA.normalize([pixel])[0], 1.0)
     resized = CAMERA.resized(round(160 * factor), round(120 * factor))
@@ -50,7 +50,7 @@ def test_a_cropped_camera_renders_the_part_of_the_image(offset: tuple[int, int])
     assert (part.width, part.height, part.distortion) == (100, 80, CAMERA.distortion)
 
 
-def test_pixels_move_as_opencv_resizes_an_image() -> None:
+def test_rescaled_pixels_agree_with_opencv_resizing() -> None:
     image = np.zeros((120, 160), dtype=np.float32)
     image[40:44, 90:96] = 1
     small = cv2.resize(image, (80, 60), interpolation=cv2.INTER_AREA)
@@ -58,7 +58,7 @@ def test_pixels_move_as_opencv_resizes_an_image() -> None:
     np.testing.assert_allclose(image_centroid(small), moved, atol=1e-6)
 
 
-def test_no_other_module_writes_the_conversions_out() -> None:
+def test_no_other_module_repeats_the_conversions() -> None:
     patterns = re.compile(r"[\[(]1(\.0)?, -1(\.0)?, -1(\.0)?[\])]|c[xy] [+-] 0?\.5|PIXEL_CENTRE = ")
     found = [
         path.relative_to(SOURCES).as_posix()

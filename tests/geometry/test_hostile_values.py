@@ -1,4 +1,4 @@
-"""Values of any kind where numbers belong: the package's own errors, and no warnings."""
+"""Values of any type in place of numbers: only cadalign's errors, and no warnings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _no_warnings() -> Iterator[None]:
 
 
 def read_or_refuse(act: Callable[[], object]) -> None:
-    """Call it; an error must be of the package's family and short."""
+    """Call ``act``; it may only raise a short `CadalignError`."""
     message = ""
     try:
         act()
@@ -40,7 +40,7 @@ def read_or_refuse(act: Callable[[], object]) -> None:
 
 
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
-def test_cameras_and_alignments_take_any_value_or_refuse_it(value: Any) -> None:
+def test_cameras_and_alignments_read_or_refuse_any_value(value: Any) -> None:
     camera, alignment = CAMERA.to_dict(), Alignment.identity().to_dict()
     for reader in (Camera, Alignment, Result):
         read_or_refuse(lambda reader=reader: reader.from_dict(value))  # type: ignore[misc]
@@ -63,7 +63,7 @@ def test_cameras_and_alignments_take_any_value_or_refuse_it(value: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
 @pytest.mark.parametrize("model", COLMAP_PARAMS)
-def test_any_parameter_of_a_lens_is_used_or_refused(model: str, value: Any) -> None:
+def test_lens_parameters_of_any_type_are_read_or_refused(model: str, value: Any) -> None:
     for place in range(len(COLMAP_PARAMS[model])):
         params: list[Any] = [500.0] * len(COLMAP_PARAMS[model])
         params[place] = value
@@ -73,7 +73,7 @@ def test_any_parameter_of_a_lens_is_used_or_refused(model: str, value: Any) -> N
 
 
 @pytest.mark.parametrize("value", ["1.0", b"1", ["1.0"], [1.0, "2"], np.array(["1"])])
-def test_texts_are_no_numbers(value: Any) -> None:
+def test_texts_are_refused_as_numbers(value: Any) -> None:
     shape = (None,) * np.ndim(value)
     assert refusal_text(lambda: as_floats(value, name="sigma", shape=shape)) == (
         "sigma: not an array of numbers (they are texts)"

@@ -1,4 +1,4 @@
-"""The mesh: its bounds, its surface points in file order, and what it refuses."""
+"""Mesh: bounds, surface points and validation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POLYGON = np.array([0, 0, 1])
 MESH = Mesh(VERTICES, FACES, POLYGON, source="house.obj")
 
 
-def test_bounds_leave_out_vertices_that_no_face_uses() -> None:
+def test_bounds_ignore_unused_vertices() -> None:
     assert MESH.bounds.tolist() == [[0, 0, 0], [1, 1, 2]]
 
 
@@ -28,20 +28,20 @@ def test_triangles_are_the_corners_in_file_order() -> None:
     assert MESH.triangles[2].tolist() == [[0, 0, 0], [1, 0, 0], [0, 0, 2]]
 
 
-def test_faces_are_numbered_one_by_one_where_the_file_does_not_say_otherwise() -> None:
+def test_faces_are_numbered_by_default() -> None:
     mesh = Mesh(VERTICES, FACES)
     assert mesh.polygon.tolist() == [0, 1, 2]
     assert mesh.face_material.tolist() == [0, 0, 0]
 
 
-def test_surface_points_count_faces_as_the_file_does() -> None:
+def test_surface_points_use_face_numbers_of_the_file() -> None:
     corners = np.eye(3)
     assert MESH.surface_points([1, 1, 1], corners).tolist() == MESH.triangles[2].tolist()
     assert MESH.surface_points([0, 0, 0], corners).tolist() == MESH.triangles[0].tolist()
 
 
 @given(seed=st.integers(0, 2**32 - 1), total=st.floats(0.5, 2.0))
-def test_surface_points_do_not_depend_on_the_weights_sum(seed: int, total: float) -> None:
+def test_surface_points_do_not_depend_on_the_sum_of_weights(seed: int, total: float) -> None:
     weights = np.random.default_rng(seed).dirichlet(np.ones(3), 4)
     face = [0, 1, 1, 0]
     expected = MESH.surface_points(face, weights)
@@ -63,7 +63,7 @@ def test_surface_points_move_with_the_stretch(seed: int) -> None:
 
 
 @pytest.mark.parametrize("number", [2, 7, -1])
-def test_surface_points_refuse_faces_that_are_not_there(number: int) -> None:
+def test_surface_points_refuse_missing_faces(number: int) -> None:
     with pytest.raises(InputError) as caught:
         MESH.surface_points([0, number], np.full((2, 3), 1 / 3))
     assert str(caught.value) == (
@@ -71,7 +71,7 @@ def test_surface_points_refuse_faces_that_are_not_there(number: int) -> None:
     )
 
 
-def test_the_closest_point_beats_all_others() -> None:
+def test_closest_points_are_nearer_than_other_surface_points() -> None:
     rng = np.random.default_rng(0)
     samples = rng.dirichlet((1, 1, 1), size=(3, 700))
     for _ in range(40):
@@ -124,12 +124,12 @@ def test_the_closest_point_beats_all_others() -> None:
         ),
     ],
 )
-def test_mesh_refuses_what_is_none(arguments: dict[str, Any], text: str) -> None:
+def test_mesh_refuses_wrong_arrays(arguments: dict[str, Any], text: str) -> None:
     with pytest.raises(DataError) as caught:
         Mesh(**arguments, source="house.obj")
     assert str(caught.value) == text
 
 
-def test_mesh_says_which_vertex_is_negative() -> None:
+def test_mesh_names_a_negative_vertex() -> None:
     with pytest.raises(DataError, match="a face names vertex -1, but there are 6"):
         Mesh(VERTICES, [[0, 1, -1]], source="house.obj")

@@ -1,4 +1,4 @@
-"""Metrics do not change under a model's symmetry or a change of the camera's frame."""
+"""Metrics are invariant to a model's symmetry and to the camera's frame."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ stretches = st.floats(0.6, 1.6)
 
 @st.composite
 def alignments(draw: st.DrawFn) -> Alignment:
-    """Poses with the same stretch along x and z, which the rotations about y exchange."""
+    """Poses with equal stretches along x and z, which rotations about y exchange."""
     across = draw(stretches)
     scale = np.array([across, draw(stretches), across])
     return Alignment(draw(rotations), draw(places), scale)
 
 
-def turned(alignment: Alignment, angle: float) -> Alignment:
-    """The alignment of the model after a rotation about its y axis, which keeps its scales."""
+def turn_model(alignment: Alignment, angle: float) -> Alignment:
+    """Rotate the model about its y axis, which keeps its scales."""
     rotation = alignment.rotation @ rotation_from_vector(angle * UP)
     return Alignment(rotation, alignment.translation, alignment.scale)
 
@@ -49,14 +49,14 @@ def errors(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> np.ndarr
 @pytest.mark.parametrize("fold", [None, 2, 3, 4, 6])
 @settings(deadline=None, max_examples=30)
 @given(est=alignments(), gt=alignments(), angle=st.floats(-3, 3))
-def test_errors_are_those_of_any_equal_alignments(
+def test_equivalent_alignments_have_the_same_errors(
     fold: int | None, est: Alignment, gt: Alignment, angle: float
 ) -> None:
     symmetry, step = Symmetry.around(UP, fold=fold), angle
     if fold is not None:
         step = 2 * np.pi / fold * round(angle * fold / (2 * np.pi))
     expected = errors(est, gt, symmetry)
-    # The angle of a rotation near 0 is known to the root of rounding.
-    found = errors(turned(est, -step), turned(gt, step), symmetry)
+    # Near 0, the angle has an error of the square root of the rounding error.
+    found = errors(turn_model(est, -step), turn_model(gt, step), symmetry)
     np.testing.assert_allclose(found, expected, atol=1e-4)
     assert expected[0] <= rotation_error(est=est, gt=gt) + 1e-4

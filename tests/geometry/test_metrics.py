@@ -1,4 +1,4 @@
-"""The metrics: perfect scores, closed forms, and independent ways to the same number."""
+"""Metrics: perfect scores, closed forms and independent computations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def random_alignment(seed: int) -> Alignment:
     return Alignment(random_rotation(rng), translation, [1.0, *rng.uniform(0.5, 2, 2)])
 
 
-def turned(angle_deg: float, axis: Any = (0, 0, 1)) -> np.ndarray:
+def rotation_about(angle_deg: float, axis: Any = (0, 0, 1)) -> np.ndarray:
     axis = np.asarray(axis, dtype=float)
     vector = np.radians(angle_deg) * axis / np.linalg.norm(axis)
     return Rotation.from_rotvec(vector).as_matrix()
@@ -47,7 +47,7 @@ def turned(angle_deg: float, axis: Any = (0, 0, 1)) -> np.ndarray:
 def test_perfect_estimate_scores_perfectly(seed: int) -> None:
     gt = random_alignment(seed)
     est = Alignment.from_dict(gt.to_dict())
-    # Rounding in the truth's own matrix is all that a perfect estimate may be charged with.
+    # Only the rounding error of the truth's matrix is allowed.
     assert rotation_error(est=est, gt=gt) < 1e-12
     assert translation_error(est=est, gt=gt) == 0.0
     assert translation_error_up_to_scale(est=est, gt=gt) == 0.0
@@ -63,15 +63,15 @@ def test_perfect_estimate_scores_perfectly(seed: int) -> None:
 def test_rotation_error_is_the_angle_from_tiny_to_half_a_turn(
     axis: tuple[int, ...], angle: float
 ) -> None:
-    base = turned(77, (3, 1, 2))
-    est = Alignment(turned(angle, axis) @ base, np.zeros(3), np.ones(3))
+    base = rotation_about(77, (3, 1, 2))
+    est = Alignment(rotation_about(angle, axis) @ base, np.zeros(3), np.ones(3))
     gt = Alignment(base, np.zeros(3), np.ones(3))
-    # Entries of a matrix carry 1e-16, which is 1e-14 degrees; near half a turn its square root.
+    # Rounding errors of 1e-16 are 1e-14 degrees, or near 180 degrees their square root.
     tolerance = 3e-14 if angle < 170 else 2e-6
     assert rotation_error(est=est, gt=gt) == pytest.approx(angle, rel=1e-9, abs=tolerance)
 
 
-def test_scale_error_is_relative_to_the_truth_and_keeps_the_axes_apart() -> None:
+def test_scale_error_is_relative_and_per_axis() -> None:
     est = Alignment(np.eye(3), np.zeros(3), [1.0, 1.5, 1.0])
     gt = Alignment(np.eye(3), np.zeros(3), [1.0, 1.0, 2.0])
     assert scale_error(est=est, gt=gt).tolist() == [0.0, 0.5, 0.5]
@@ -91,16 +91,16 @@ CUBE = Box([0, 0, 0], np.eye(3), [1, 1, 1])
         (Box([0.5, 0.5, 0.5], np.eye(3), [1, 1, 1]), 1 / 15),
         (Box([0.3, -0.2, 0.1], np.eye(3), [1, 1, 1]), 0.504 / 1.496),
         (Box([0, 0, 0], np.eye(3), [0.5, 0.5, 0.5]), 1 / 8),  # contained
-        (Box([0.2, 0.1, 0], turned(30, (1, 1, 0)), [0.2, 0.3, 0.1]), 0.006),
+        (Box([0.2, 0.1, 0], rotation_about(30, (1, 1, 0)), [0.2, 0.3, 0.1]), 0.006),
         (Box([0, 0, 0], np.eye(3), [3, 0.5, 0.5]), 0.25 / 1.5),  # runs through
-        (Box([0, 0, 0], turned(90), [1, 1, 1]), 1.0),  # the same, named differently
-        (Box([0, 0, 0], turned(120, (1, 1, 1)), [1, 1, 1]), 1.0),
+        (Box([0, 0, 0], rotation_about(90), [1, 1, 1]), 1.0),  # the same box with other axes
+        (Box([0, 0, 0], rotation_about(120, (1, 1, 1)), [1, 1, 1]), 1.0),
         (Box([1, 0, 0], np.eye(3), [1, 1, 1]), 0.0),  # touches in a face
         (Box([1, 1, 0], np.eye(3), [1, 1, 1]), 0.0),  # in an edge
         (Box([1, 1, 1], np.eye(3), [1, 1, 1]), 0.0),  # in a corner
-        (Box([0.5 + np.sqrt(0.5), 0, 0], turned(45), [1, 1, 1]), 0.0),  # its edge in a face
+        (Box([0.5 + np.sqrt(0.5), 0, 0], rotation_about(45), [1, 1, 1]), 0.0),  # its edge in a face
         (Box([1.001, 0, 0], np.eye(3), [1, 1, 1]), 0.0),  # apart
-        (Box([50, 60, 70], turned(30, (1, 2, 3)), [1, 1, 1]), 0.0),
+        (Box([50, 60, 70], rotation_about(30, (1, 2, 3)), [1, 1, 1]), 0.0),
     ],
 )
 def test_box_iou_of_known_pairs(est: Box, expected: float) -> None:
@@ -162,8 +162,8 @@ def test_box_iou_is_symmetric_and_does_not_depend_on_frame_or_unit(seed: int, fr
 def test_box_iou_is_continuous_at_a_perfect_estimate(seed: int, angle: float) -> None:
     gt, _ = overlapping_boxes(seed)
     axis = np.random.default_rng(seed).standard_normal(3)
-    est = Box(gt.center, turned(np.degrees(angle), axis) @ gt.rotation, gt.extents)
-    # A turn by an angle moves a face by at most half a diagonal times the angle.
+    est = Box(gt.center, rotation_about(np.degrees(angle), axis) @ gt.rotation, gt.extents)
+    # A rotation moves a face by at most half a diagonal times the angle.
     largest = 4 * angle * np.linalg.norm(gt.extents) / gt.extents.min()
     assert 1 - box_iou(est=est, gt=gt) <= largest + 1e-11
 
@@ -180,7 +180,7 @@ def test_box_iou_refuses_flat_boxes(name: str, flat_first: bool) -> None:
 
 
 def boxes_before_the_camera(seed: int) -> tuple[Box, Box]:
-    """Two boxes near the optical axis, most of them in nearly the same direction."""
+    """Two boxes near the optical axis, usually in nearly the same direction."""
     rng = np.random.default_rng(seed)
     gt = Box([*rng.uniform(-0.5, 0.5, 2), 3.0], random_rotation(rng), rng.uniform(0.3, 1.5, 3))
     factor = np.exp(rng.uniform(-2, 2))
@@ -206,9 +206,7 @@ def test_box_iou_up_to_scale_is_the_largest_over_all_factors(seed: int) -> None:
 
 @pytest.mark.long
 @given(seed=SEEDS, logarithm=st.floats(-3, 3))
-def test_box_iou_up_to_scale_depends_on_neither_scale_nor_order(
-    seed: int, logarithm: float
-) -> None:
+def test_box_iou_up_to_scale_is_invariant_to_scale_and_order(seed: int, logarithm: float) -> None:
     est, gt = boxes_before_the_camera(seed)
     found = box_iou_up_to_scale(est=est, gt=gt)
     factor = float(np.exp(logarithm))

@@ -1,4 +1,4 @@
-"""Cameras that are hardly right are questioned, right ones are not."""
+"""Doubts about implausible cameras."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RIGHT = Camera(640, 480, 935, 935, 319.5, 239.5)
     ],
     ids=["larger image", "corner", "oblong", "millimetres"],
 )
-def test_implausible_cameras_are_questioned_first(camera: Camera, words: str) -> None:
+def test_implausible_cameras_are_doubted(camera: Camera, words: str) -> None:
     (doubt,) = camera_doubts(camera)
     assert words in doubt
     rng = np.random.default_rng(0)
@@ -46,11 +46,11 @@ def test_implausible_cameras_are_questioned_first(camera: Camera, words: str) ->
     ],
     ids=["usual", "part of a photo", "calibrated", "fisheye", "unknown"],
 )
-def test_plausible_cameras_are_not(camera: Camera) -> None:
+def test_plausible_cameras_are_not_doubted(camera: Camera) -> None:
     assert camera_doubts(camera) == ()
 
 
-def test_keypoints_that_agree_confirm_a_wide_camera() -> None:
+def test_consistent_keypoints_confirm_a_wide_camera() -> None:
     problem = simulate_problem(np.random.default_rng(1), points=10, noise_px=1.0)
     assert len(camera_doubts(problem.camera)) == 1
     assert fit(problem.points_3d, problem.points_2d, problem.camera).warnings == ()

@@ -1,4 +1,4 @@
-"""Rotations: each form turns into the others and back."""
+"""Rotations: conversions between representations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 
 
 @given(vector=vectors, length=st.floats(1e-3, 1e3))
-def test_quaternions_of_any_length_give_their_rotation_back(vector, length) -> None:
+def test_quaternions_of_any_length_round_trip(vector, length) -> None:
     rotation = rotation_from_vector(vector)
     quaternion = quat_wxyz_from_rotation(rotation)
     assert quaternion[0] >= 0
@@ -41,11 +41,11 @@ def test_quaternion_without_direction_is_refused(quaternion) -> None:
 
 
 @pytest.mark.parametrize("count", [60, 500])
-def test_spread_rotations_are_about_as_far_from_each_other(count: int) -> None:
+def test_spread_rotations_are_evenly_spaced(count: int) -> None:
     rotations = spread_rotations(count)
     traces = np.einsum("aij,bij->ab", rotations, rotations)
     angles = np.arccos(np.clip((traces - 1) / 2, -1, 1))
     nearest = np.sort(angles, axis=1)[:, 1]
     assert nearest.max() < 1.6 * nearest.min()
-    # As many balls of that radius have about the volume of all rotations.
+    # That many balls of this radius have about the volume of all rotations.
     assert count * (nearest.min() - np.sin(nearest.min())) / np.pi > 0.8

@@ -1,4 +1,4 @@
-"""Grid clustering and mesh edges, also of soups whose triangles share nothing or face any way."""
+"""Grid clustering and mesh edges, also of triangle soups with any orientation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cadalign.geometry.simplify import cluster, mesh_edges, number_rows, simplif
 
 
 def soup(mesh: trimesh.Trimesh, *, seed: int = 0) -> Mesh:
-    """Triangles with vertices of their own, moved by a rounding error, half of them turned."""
+    """Split a mesh into separate triangles with rounding errors, half of them reversed."""
     rng = np.random.default_rng(seed)
     corners = np.array(mesh.triangles)
     turned = rng.random(len(corners)) < 0.5
@@ -20,7 +20,7 @@ def soup(mesh: trimesh.Trimesh, *, seed: int = 0) -> Mesh:
     return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
 
 
-def test_clustering_welds_a_soup_into_the_solid_it_came_from() -> None:
+def test_clustering_welds_a_triangle_soup() -> None:
     box = trimesh.creation.box((1, 2, 3))
     doubled = soup(trimesh.util.concatenate([box, box]))
     welded = cluster(doubled, cells=1e4)
@@ -61,7 +61,7 @@ def test_opposite_vertices_are_those_of_both_triangles() -> None:
 
 
 @pytest.mark.parametrize("most", [20, 300, 3000])
-def test_simplification_uses_most_of_what_is_allowed_and_stays_near(most: int) -> None:
+def test_simplification_is_near_the_maximum_and_the_surface(most: int) -> None:
     ball = trimesh.creation.icosphere(subdivisions=5)
     mesh = Mesh(np.array(ball.vertices), np.array(ball.faces))
     small = simplify(mesh, max_faces=most)
@@ -74,8 +74,8 @@ def test_simplification_uses_most_of_what_is_allowed_and_stays_near(most: int) -
     assert np.linalg.norm(gaps, axis=1).max() < 5 / np.sqrt(most)  # each lies where its source does
 
 
-def test_a_fan_that_no_grid_divides_keeps_some_triangles() -> None:
-    """All but one vertex in one cell of any grid: every clustering leaves nothing."""
+def test_a_fan_that_no_grid_simplifies_keeps_triangles() -> None:
+    """All but one vertex share a cell of any grid, so no clustering leaves a triangle."""
     vertices = np.concatenate([[[1e9, 0, 0]], np.random.default_rng(0).uniform(0, 1, (30, 3))])
     faces = np.array([[1, k, k + 1] for k in range(2, 30)])
     vertices[1:, 1:] *= np.linspace(1, 2, 30)[:, None]

@@ -1,4 +1,4 @@
-"""Symmetries: groups of rotations, their forms, equal alignments under stretch, and errors."""
+"""Symmetries: groups, files, equivalent alignments of stretched models, and errors."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def symmetries():
     return around | discs | spheres
 
 
-def element(group, data):
-    """Any motion (4, 4) of the group."""
+def draw_motion(group, data):
+    """Draw a motion (4, 4) of the group."""
     if len(group.axes) == 3:
         rotation = data.draw(turns)
     else:
@@ -51,8 +51,8 @@ def element(group, data):
     return motion
 
 
-def placed(alignment, motion):
-    """An alignment of equal stretches after a motion of the model."""
+def move(alignment, motion):
+    """Move the model of an alignment by a motion."""
     return Alignment(
         alignment.rotation @ motion[:3, :3],
         alignment.translation + alignment.linear @ motion[:3, 3],
@@ -67,7 +67,7 @@ def test_a_group_is_closed_and_has_inverses(group):
     for first in group.rotations:
         for second in (*group.rotations, *(each.T for each in group.rotations)):
             product = first @ second
-            if len(group.axes):  # but for a rotation about the axis
+            if len(group.axes):  # up to a rotation about the axis
                 about = group.axes[0]
                 cosines = [about @ product.T @ each @ about for each in group.rotations]
                 assert max(cosines) == pytest.approx(1)
@@ -78,16 +78,16 @@ def test_a_group_is_closed_and_has_inverses(group):
 @pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(symmetries(), turns, vectors, st.floats(0.5, 2), turns | st.none(), st.data())
-def test_the_canonical_alignment_is_that_of_all_equal_ones(
+def test_equivalent_alignments_have_the_same_canonical_one(
     group, rotation, translation, size, reference, data
 ):
     alignment = Alignment(rotation, translation, np.full(3, size))
-    equal = placed(alignment, element(group, data))
+    equal = move(alignment, draw_motion(group, data))
     first = group.canonical(alignment, reference=reference).alignment
     second = group.canonical(equal, reference=reference).alignment
     again = group.canonical(first, reference=reference).alignment
     near = FACING if reference is None else reference
-    # The nearest to the reference; beyond that ties may remain for special rotations alone.
+    # Nearest to the reference; ties remain only for special rotations.
     assert angles_between(first.rotation, near) == pytest.approx(
         angles_between(second.rotation, near), abs=1e-3
     )
@@ -111,13 +111,13 @@ def test_the_motion_leads_to_the_canonical_alignment(fold, rotation, across, up)
 
 
 def count_equal(group, alignment, held):
-    """Number of alignments that are equal to one; None for any number."""
-    kept = list(group._kept(alignment.scale, held, 1e-4))
+    """Number of equivalent alignments; None for infinitely many."""
+    kept = list(group._allowed_branches(alignment.scale, held, 1e-4))
     return None if any(len(axes) for (_, axes), _ in kept) else len(kept)
 
 
-def test_of_an_axis_a_stretch_across_it_leaves_half_turns():
-    """The ellipse under the stretched circle is that of half turns and exchanged axes alone."""
+def test_a_stretch_across_an_axis_keeps_half_turns():
+    """A stretched circle, an ellipse, keeps half turns; quarter turns exchange its axes."""
     group = Symmetry.around(UP, fold=None)
     free, held = (False, False, False), (True, False, False)
     round_one = Alignment(np.eye(3), [0, 0, 5], [1.1, 2, 1.1])
@@ -126,7 +126,7 @@ def test_of_an_axis_a_stretch_across_it_leaves_half_turns():
     assert (count_equal(group, flat, held), count_equal(group, flat, free)) == (2, 4)
 
 
-def test_a_quarter_turn_exchanges_the_stretches_it_turns():
+def test_a_quarter_turn_exchanges_stretches():
     group = Symmetry.around(UP, fold=4)
     long, wide = [1.0, 1.2, 1.5], [1.5, 1.2, 1.0]
     quarter = Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix()
@@ -138,7 +138,7 @@ def test_a_quarter_turn_exchanges_the_stretches_it_turns():
     found = group.canonical(second)
     np.testing.assert_allclose(found.alignment.rotation, FACING, atol=1e-12)
     np.testing.assert_allclose(found.alignment.scale, long)
-    # With x known, the turned one would be another size, and stays.
+    # If x is held, the turned alignment is not allowed.
     kept = group.canonical(second, held=(True, False, False)).alignment
     np.testing.assert_allclose(kept.scale, wide)
     assert angles_between(kept.rotation, second.rotation) in (0.0, pytest.approx(180))
@@ -146,16 +146,16 @@ def test_a_quarter_turn_exchanges_the_stretches_it_turns():
 
 
 @pytest.mark.parametrize("scale", [(1, 1, 1), (1, 1.5, 1), (0.7, 1, 1), (1, 2, 3)])
-def test_of_a_sphere_the_stretch_leaves_what_an_ellipsoid_has(scale):
+def test_a_stretched_sphere_has_the_symmetries_of_an_ellipsoid(scale):
     group = BALL
     alignment = Alignment(Rotation.random(random_state=3).as_matrix(), [0, 0, 9], scale)
     count = {1: None, 2: None, 3: 24}[len(set(scale))]
     assert count_equal(group, alignment, (False, False, False)) == count
-    if count == 24:  # with the scales held, the half turns
+    if count == 24:  # only half turns if the scales are held
         assert count_equal(group, alignment, (True, True, True)) == 4
     found = group.canonical(alignment)
     assert len(found.free) == {1: 3, 2: 1, 3: 0}[len(set(scale))]
-    # The ellipsoid |S^-1 R' (x - t)| = 1 stays in place.
+    # The ellipsoid |S^-1 R' (x - t)| = 1 does not change.
     before, after = (
         each.rotation @ np.diag(each.scale**2) @ each.rotation.T
         for each in (alignment, found.alignment)
@@ -170,7 +170,7 @@ def test_the_cube_has_24_rotations():
 
 
 @pytest.mark.long
-def test_a_rotation_that_returns_late_is_refused():
+def test_a_rotation_of_high_order_is_refused():
     late = rotation_from_vector(2 * np.pi / 301 * np.array(UP))
     with pytest.raises(InputError, match="more than 240 rotations"):
         Symmetry(np.zeros(3), late[None])
@@ -189,15 +189,15 @@ def test_rotations_by_equal_angles_are_a_group(fold):
 
 
 @pytest.mark.parametrize("fold", [0, -3, True, 2.5, "2", 10**9])
-def test_what_is_no_number_of_rotations_is_refused(fold):
-    with pytest.raises(InputError, match=rf"^symmetry.fold: '{fold}' is no number of rotations"):
+def test_wrong_numbers_of_rotations_are_refused(fold):
+    with pytest.raises(InputError, match=rf"^symmetry.fold: '{fold}' is not a number of rotations"):
         Symmetry.around((0, 1, 0), fold=fold)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
-def test_the_error_about_an_axis_is_the_least_over_all_angles(seed):
-    """Flips turn the axis round, so that all motions are those about it, after a flip or none."""
+def test_the_error_with_an_axis_is_the_least_over_all_angles(seed):
+    """A flip reverses the axis; all motions are rotations about it, with or without the flip."""
     direction = np.array([0.0, *np.random.default_rng(seed).normal(size=2)])
     symmetry = Symmetry(np.zeros(3), FLIP[None], direction[None])
     est, gt = pose(Rotation.random(random_state=seed)), pose(Rotation.random(random_state=seed + 9))
@@ -215,13 +215,13 @@ def test_the_error_about_an_axis_is_the_least_over_all_angles(seed):
 def test_the_error_is_the_least_over_all_turns():
     est, gt = pose(Rotation.from_euler("y", 25, degrees=True)), pose(Rotation.identity())
     assert rotation_error(est=est, gt=gt, symmetry=Symmetry.none()) == pytest.approx(25)
-    # 25 deg is 25 from 0 and 20 from 45, of the rotations by 0, 45, 90, ... deg.
+    # The rotations are by 0, 45, 90, ... deg; the nearest to 25 deg is 45.
     eight = Symmetry.around((0, 1, 0), fold=8)
     assert rotation_error(est=est, gt=gt, symmetry=eight) == pytest.approx(20)
 
 
-def test_no_turn_of_a_ball_is_an_error_by_any_metric():
-    """Two axes make every rotation, also those that no turn about one of them reaches."""
+def test_rotations_of_a_sphere_are_no_error_in_any_metric():
+    """Two axes generate every rotation."""
     turned = {"est": pose(Rotation.random(random_state=1)), "gt": pose(Rotation.identity())}
     assert rotation_error(**turned, symmetry=BALL) == pytest.approx(0, abs=1e-5)
     assert scan2cad_errors(**turned, symmetry=BALL)["rotation_error_deg"] == pytest.approx(
@@ -229,7 +229,7 @@ def test_no_turn_of_a_ball_is_an_error_by_any_metric():
     )
 
 
-def test_what_is_no_rotation_is_refused():
+def test_wrong_rotations_and_axes_are_refused():
     with pytest.raises(InputError, match=r"symmetry.rotations\[0\]: not a rotation"):
         Symmetry(np.zeros(3), np.diag([1.0, 1, -1])[None])
     with pytest.raises(InputError, match="not a rotation"):
@@ -263,14 +263,17 @@ def test_every_form_is_read_and_written(data, count, axes):
     [
         (4, "symmetry: expected an object, got int"),
         ({}, "symmetry: the fields"),
-        ({"axis": [0, 1, 0]}, "symmetry: the fields axis are no symmetry's"),
+        ({"axis": [0, 1, 0]}, "symmetry: the fields axis are not a symmetry"),
         ({"axis": [0, 1], "fold": 2}, "symmetry.axis: "),
-        ({"axis": [0, 1, 0], "fold": 0}, "symmetry.fold: '0' is no number of rotations"),
+        ({"axis": [0, 1, 0], "fold": 0}, "symmetry.fold: '0' is not a number of rotations"),
         (SPHERE | {"rotations": [[1, 2]]}, "symmetry.rotations: shape"),
         (SPHERE | {"axes": 3}, "symmetry.axes: shape"),
-        ({"symmetries_discrete": []}, "symmetry: the fields symmetries_discrete are no symmetry"),
+        (
+            {"symmetries_discrete": []},
+            "symmetry: the fields symmetries_discrete are not a symmetry",
+        ),
     ],
 )
-def test_other_forms_are_refused_by_their_field(data, message):
+def test_wrong_forms_are_refused_by_field(data, message):
     with pytest.raises(InputError, match=message):
         Symmetry.from_dict(data)

@@ -25,7 +25,7 @@ def test_keypoints_on_a_part_of_a_mesh_are_accepted(share: float) -> None:
 
 
 def test_keypoints_of_another_model_are_refused() -> None:
-    with pytest.raises(InputError, match=r"keypoint 3 lies 6\.\d+ diagonals of the mesh from it"):
+    with pytest.raises(InputError, match=r"keypoint 3 lies 6\.\d+ mesh diagonals from the mesh"):
         check_near(np.vstack([CORNERS[:3], [[8.0, 0.0, 0.0]]]), BOUNDS, where="points_3d")
 
 

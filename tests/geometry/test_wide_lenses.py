@@ -1,4 +1,4 @@
-"""Fisheye lenses: projection, inverse and derivatives, beyond 90 degrees too."""
+"""Fisheye lenses: projection, inverse and derivatives, also beyond 90 degrees."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ LENSES = {
         640, 640, 180.0, 185.0, 320.25, 318.5, (0.05, -0.02, 0.01, -0.001), lens="fisheye"
     ),
 }
-WIDEST = math.radians(110)  # of the lenses above, at which all can be inverted
+WIDEST = math.radians(110)  # all lenses above can be inverted up to this angle
 every_lens = pytest.mark.parametrize("name", LENSES)
 any_seed = given(seed=st.integers(0, 2**32 - 1))
 
 
 def directions(seed: int, *, widest: float = WIDEST, count: int = 40) -> np.ndarray:
-    """Points at random angles off the axis, and at random distances; the first lies on the axis."""
+    """Points at random angles and distances; the first lies on the axis."""
     rng = np.random.default_rng(seed)
     theta, phi = rng.uniform(0, widest, count), rng.uniform(0, 2 * np.pi, count)
     theta[0] = 0.0
@@ -40,7 +40,7 @@ def directions(seed: int, *, widest: float = WIDEST, count: int = 40) -> np.ndar
 
 @every_lens
 @any_seed
-def test_fisheye_projects_as_opencvs(name: str, seed: int) -> None:
+def test_fisheye_projection_agrees_with_opencv(name: str, seed: int) -> None:
     camera, points = LENSES[name], directions(seed, widest=math.radians(89.5))
     expected, _ = cv2.fisheye.projectPoints(
         points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
@@ -50,7 +50,7 @@ def test_fisheye_projects_as_opencvs(name: str, seed: int) -> None:
 
 @every_lens
 @any_seed
-def test_unproject_undoes_project(name: str, seed: int) -> None:
+def test_unproject_inverts_project(name: str, seed: int) -> None:
     camera, points = LENSES[name], directions(seed)
     expected = points / np.linalg.norm(points, axis=1, keepdims=True)
     np.testing.assert_allclose(camera.unproject(camera.project(points)), expected, atol=1e-9)
@@ -71,7 +71,7 @@ def test_a_turned_frame_changes_no_pixel(name: str, seed: int) -> None:
 
 @every_lens
 @any_seed
-def test_slopes_are_those_of_finite_differences(name: str, seed: int) -> None:
+def test_derivatives_agree_with_finite_differences(name: str, seed: int) -> None:
     camera = LENSES[name]
     points = directions(seed)
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -82,7 +82,7 @@ def test_slopes_are_those_of_finite_differences(name: str, seed: int) -> None:
     )
 
 
-def test_a_perspective_lens_has_the_slopes_of_finite_differences() -> None:
+def test_perspective_derivatives_agree_with_finite_differences() -> None:
     camera = Camera(640, 480, 500, 520, 310, 245, (-0.2, 0.05, 0.01, 0.02))
     points = directions(3, widest=0.5)
     steps = 1e-6 * np.eye(3)
@@ -101,7 +101,7 @@ def test_beyond_the_fold_nothing_is_seen() -> None:
     with pytest.raises(InputError) as caught:
         camera.project(points)
     assert str(caught.value) == (
-        "points_cam: 1 of 2 points lie outside the lens's field, the first is point 1; "
+        "points_cam: 1 of 2 points lie outside the lens's field of view, the first is point 1; "
         "only points less than 104.6 degrees off the axis have a projection"
     )
     assert np.isinf(camera.project_where_ahead(points)[1]).all()
@@ -110,7 +110,7 @@ def test_beyond_the_fold_nothing_is_seen() -> None:
     assert np.isfinite(rays).all()
 
 
-def test_normalize_refuses_rays_beside_the_plane() -> None:
+def test_normalize_refuses_rays_beside_the_camera() -> None:
     camera = LENSES["equidistant"]
     pixels = camera.project([[0, 0, 1], [1, 0, -0.1], [0, 1, -0.2]])
     with pytest.raises(InputError) as caught:
@@ -140,7 +140,7 @@ def test_impossible_lenses_are_refused(given: dict[str, object], text: str) -> N
         Camera(640, 480, 500, 500, 320, 240, **given)  # type: ignore[arg-type]
 
 
-def test_files_of_wide_lenses_want_a_focal_length() -> None:
+def test_files_of_wide_lenses_need_a_focal_length() -> None:
     data = {
         "model": "OPENCV_FISHEYE",
         "width": 9,
@@ -152,12 +152,12 @@ def test_files_of_wide_lenses_want_a_focal_length() -> None:
 
 
 def test_a_turned_frame_is_not_written() -> None:
-    with pytest.raises(InputError, match="a camera in a turned frame has no form in files"):
+    with pytest.raises(InputError, match="a camera with a turned frame cannot be written"):
         LENSES["opencv"].turned(np.eye(3)).to_dict()
 
 
 def test_a_pinhole_is_not_turned() -> None:
-    with pytest.raises(InputError, match="the frame of a pinhole is its own"):
+    with pytest.raises(InputError, match="a perspective camera cannot be turned"):
         Camera(640, 480, 500, 500, 320, 240).turned(np.eye(3))
 
 

@@ -1,4 +1,4 @@
-"""Gaussians of vectors with missing entries, against complete data and SciPy's densities."""
+"""Gaussians of vectors with missing entries, compared with complete data and SciPy."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_missing_entries_are_recovered_from_the_others() -> None:
 
 
 @pytest.mark.slow
-def test_every_round_makes_the_vectors_more_likely() -> None:
+def test_every_iteration_increases_the_likelihood() -> None:
     rng = np.random.default_rng(1)
     values = correlated(rng, 100, 5)
     values[:60, 4] = np.nan
@@ -83,14 +83,14 @@ def test_every_round_makes_the_vectors_more_likely() -> None:
     assert (np.diff(totals) > -1e-3).all()
 
 
-def test_an_entry_that_hardly_any_vector_has_keeps_a_wide_deviation() -> None:
+def test_a_rare_entry_keeps_a_large_deviation() -> None:
     values = np.random.default_rng(2).normal(size=(300, 4))
     values[1:, 3] = np.nan
     model = learn_gaussian(vectors_of(values), strength=0.0, floor=1e-3, rounds=25)
     assert 0.3 < np.sqrt(model.covariances[0][3, 3]) < 1.5
 
 
-def test_an_entry_that_no_vector_has_does_not_spoil_the_others() -> None:
+def test_an_entry_without_data_does_not_affect_the_others() -> None:
     values = np.random.default_rng(2).normal(size=(50, 3))
     values[:, 1] = np.nan
     model = learn_gaussian(vectors_of(values), strength=0.0, floor=1e-3, rounds=25)

@@ -1,4 +1,4 @@
-"""Boxes beyond keypoints, inflation by the number of keypoints, regions of errors with tails."""
+"""Box margins, inflation by the number of keypoints, and confidence regions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cadalign.errors import InputError
-from cadalign.shapes.calibration import excesses_of, learn_margins
+from cadalign.shapes.calibration import box_excesses, learn_margins
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.parts import (
     FEW,
@@ -42,12 +42,12 @@ def test_margins_and_errors_are_learned() -> None:
     vectors = rows.reshape(len(rows), -1)
     covariance = np.cov(vectors.T) + 1e-6 * np.eye(vectors.shape[1])
     mixture = Gaussians(np.ones(1), vectors.mean(axis=0)[None], covariance[None])
-    excesses = excesses_of(rows, mixture)
+    excesses = box_excesses(rows, mixture)
     learned = learn_margins(rows, excesses)
     assert learned is not None
     assert np.allclose(learned.margins, [[0.02] * 3, [0.03] * 3])
     assert ((excesses > learned.tolerances).mean(axis=0) < 0.06).all()
-    # Objects of which all keypoints are given have nearly their true boxes.
+    # Boxes of objects with all keypoints are nearly exact.
     gaps = [
         OUTWARD * (learned.bounds(row[-2:] + OUTWARD * excess, row[:-2]) - row[-2:])
         for row, excess in zip(rows, excesses, strict=True)
@@ -69,14 +69,14 @@ def test_negative_tolerances_are_refused() -> None:
 # --- inflation and tails ------------------------------------------------------------------------
 
 
-def test_the_whole_inflation_stands_from_the_typical_number_on() -> None:
+def test_the_whole_inflation_applies_from_the_typical_number() -> None:
     few = FewKeypoints(typical=12.0, share=0.7)
     assert inflation_with(12, 1.5, few) == inflation_with(100, 1.5, few) == 1.5
     assert inflation_with(3, 1.5, few) == inflation_with(FEW, 1.5, few) == pytest.approx(1.05)
     assert 1.05 < inflation_with(8, 1.5, few) < inflation_with(10, 1.5, few) < 1.5
 
 
-def test_it_is_constant_without_a_decrease() -> None:
+def test_inflation_is_constant_without_a_decrease() -> None:
     assert inflation_with(3, 1.5, None) == 1.5
 
 
@@ -91,7 +91,7 @@ def test_a_number_out_of_range_is_refused(typical: float, share: float, name: st
 
 @pytest.mark.parametrize("freedom", [None, 3.0, 5.0, 20.0])
 @pytest.mark.parametrize("dimension", [1, 2, 3])
-def test_the_radius_is_the_inverse(dimension: int, freedom: float | None) -> None:
+def test_the_radius_inverts_the_probability(dimension: int, freedom: float | None) -> None:
     for probability in (0.05, 0.68, 0.95, 0.999):
         square = radius_of(probability, dimension, freedom) ** 2
         assert probability_within(square, dimension, freedom) == pytest.approx(probability)

@@ -1,4 +1,4 @@
-"""`ShapeModel`: what is learned and given, its file, and what is refused."""
+"""`ShapeModel`: learning, bases, files and validation."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ TABLE = np.array(
     dtype=float,
 )
 IDS = list(range(7))
-CHI_SQUARE_95 = 7.815  # of three degrees of freedom
+CHI_SQUARE_95 = 7.815  # three degrees of freedom
 
 
 def tables(
     count: int, *, seed: int = 0, spread: float = 0.2, noise: float = 0.02, missing: float = 0.0
 ) -> list[Example]:
-    """Tables of random sizes, some without some keypoints."""
+    """Tables of random sizes, some with missing keypoints."""
     rng = np.random.default_rng(seed)
     found = []
     for row in range(count):
@@ -54,7 +54,7 @@ def learned() -> ShapeModel:
 
 
 @pytest.mark.long
-def test_the_mean_is_that_of_the_models(learned: ShapeModel) -> None:
+def test_the_mean_is_the_mean_of_the_models(learned: ShapeModel) -> None:
     expected = np.mean([each.points_3d for each in tables(80)], axis=0)
     assert learned.ids == tuple(IDS)
     assert np.abs(learned.mean[:-2] - expected).max() < 0.1
@@ -73,7 +73,7 @@ def test_the_modes_are_the_three_sizes(learned: ShapeModel) -> None:
 
 @pytest.mark.long
 def test_a_symmetric_category_gets_a_symmetric_shape() -> None:
-    """Across x or z, whichever explains the models; a mean of 60 is not so by itself."""
+    """The mirror is across x or z; without it a mean of 60 models is not symmetric."""
     mean = ShapeModel.learn(tables(60), components=1).components[0].mean[:-2]
     gaps = []
     for axis, partners in ((0, [1, 0, 3, 2, 5, 4, 6]), (2, [2, 3, 0, 1, 4, 5, 6])):
@@ -112,7 +112,7 @@ def test_learning_does_not_depend_on_the_unit() -> None:
 
 
 @pytest.mark.slow
-def test_without_bounds_the_boxes_are_those_of_the_keypoints() -> None:
+def test_without_bounds_boxes_are_extents_of_keypoints() -> None:
     bare = [replace(each, bounds=None) for each in tables(30)]
     model = ShapeModel.learn(bare, components=1)
     extents = np.array([[e.points_3d.min(axis=0), e.points_3d.max(axis=0)] for e in bare])
@@ -127,8 +127,8 @@ def test_few_models_still_give_a_model(count: int) -> None:
     assert (np.linalg.eigvalsh(model.components[0].covariance) > 0).all()
 
 
-def test_few_models_state_as_large_errors_as_they_make() -> None:
-    """Of shapes learned from 6 models, the 95 % regions held none of these rotations."""
+def test_few_models_predict_their_errors() -> None:
+    """Uncalibrated, the 95 % regions of 6 models hold none of these rotations."""
     model = ShapeModel.learn(tables(6, seed=1, noise=0.2))
     camera = cadalign.Camera(640, 480, 900, 900, 319.5, 239.5)
     within = 0
@@ -150,7 +150,9 @@ def test_models_on_one_line_are_learned() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 10])
-def test_models_in_another_unit_are_warned_of(count: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_models_in_another_unit_cause_a_warning(
+    count: int, caplog: pytest.LogCaptureFixture
+) -> None:
     models = tables(20)
     ShapeModel.learn(models[:6])
     assert not caplog.text
@@ -170,7 +172,7 @@ def test_models_in_another_unit_are_warned_of(count: int, caplog: pytest.LogCapt
         ([[-1, 0, 0], [0, 1, 0], [0, 0, 1]], "with (-x, y, z) as (x, y, z), mirrored;"),
     ],
 )
-def test_models_with_other_axes_are_warned_of(
+def test_models_with_other_axes_cause_a_warning(
     turn: list[list[int]], words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     models = tables(20)
@@ -186,7 +188,7 @@ def test_models_without_a_common_keypoint_are_refused() -> None:
         Example(f"{row}", [f"{row // 2} {label}" for label in IDS], TABLE + row)
         for row in range(40)
     ]
-    with pytest.raises(InputError, match="20 groups of them share no keypoint, such as those of"):
+    with pytest.raises(InputError, match="20 groups share no keypoint, for example those of"):
         ShapeModel.learn(models)
 
 
@@ -197,7 +199,7 @@ def test_models_that_are_all_the_same_are_learned_without_a_warning() -> None:
 
 
 def test_boxes_move_with_modes_that_stretch_and_shift_the_keypoints() -> None:
-    """By the same factors about the same point, though they reach beyond the keypoints."""
+    """Boxes larger than the keypoints move by the same factors about the same point."""
     mode = TABLE * [0.1, -0.2, 0.3] + [0.5, 0.0, -0.25]
     box = np.array([TABLE.min(axis=0) - 0.3, TABLE.max(axis=0) + 0.1])
     component = ShapeModel.from_basis(TABLE, [mode], [2.0], box=box).components[0]
@@ -208,7 +210,7 @@ def test_boxes_move_with_modes_that_stretch_and_shift_the_keypoints() -> None:
 
 @pytest.mark.parametrize("axis", [0, 2])
 def test_a_mirror_pairs_the_keypoints_that_it_exchanges(axis: int) -> None:
-    """In any order, off the origin, with deviations; those on the mirror stay."""
+    """Keypoints in any order, off the origin, with noise; those on the mirror are unpaired."""
     rng = np.random.default_rng(3)
     one_side = rng.uniform(0.2, 1.0, (4, 3))
     flip = np.where(np.arange(3) == axis, -1.0, 1.0)
@@ -240,8 +242,8 @@ def test_the_nearest_model_is_itself(learned: ShapeModel) -> None:
         assert learned.nearest(learned.training.points_3d[row]) == row
 
 
-def test_texts_of_numpy_are_saved_and_what_is_no_text_is_refused(tmp_path: Path) -> None:
-    """Such files were written and could not be read."""
+def test_numpy_texts_are_saved_and_other_types_refused(tmp_path: Path) -> None:
+    """Other types could be written, but not read."""
     models = [Example(np.str_(f"{row}"), IDS, TABLE * (1 + row / 9)) for row in range(5)]
     path = tmp_path / "table.shape"
     ShapeModel.learn(models, category=np.str_("table"), unit=np.str_("m")).save(path)
@@ -295,7 +297,7 @@ def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
     "change",
     [{"inflation": 0.0}, {"inflation": np.nan}, {"degrees_of_freedom": 2.0}],
 )
-def test_figures_out_of_range_are_refused(learned: ShapeModel, change: dict[str, float]) -> None:
+def test_numbers_out_of_range_are_refused(learned: ShapeModel, change: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(change))):
         replace(learned, **change)  # type: ignore[arg-type]
 
@@ -307,7 +309,7 @@ def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path) -> None:
+def test_wrong_files_are_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.shape"
     assert refusal_text(lambda: ShapeModel.open(path)) == f"{path}: no such file"
     path.write_bytes(b"hello")
@@ -358,7 +360,7 @@ def test_refusals(learned: ShapeModel) -> None:
         "models of object: 3 are too few to learn a shape from; give at least 4"
     )
     assert learn(*some, named) == (
-        "model named: its keypoints have names as ids, those of model table 0 have numbers; "
+        "model named: keypoint ids are names, but numbers in model table 0; "
         "use one kind in all models"
     )
     assert learn(*some, some[0]) == "model 'table 0': occurs twice"
@@ -389,7 +391,7 @@ def test_refusals(learned: ShapeModel) -> None:
         ({"ids": ["a"]}, "ids: 1 for 7 keypoints"),
         ({"ids": ["a"] * 7}, "ids: 'a' occurs twice"),
         ({"box": [[1, 0, 0], [0, 1, 1]]}, "box: the least corner [1.0, 0.0, 0.0] exceeds"),
-        ({"up_axis": "w"}, "up_axis: 'w' is no axis; give x, y or z"),
+        ({"up_axis": "w"}, "up_axis: 'w' is not an axis; give x, y or z"),
         ({"residual_sigma": -1}, "residual_sigma: -1 is not a standard deviation"),
     ],
 )
@@ -399,7 +401,7 @@ def test_a_wrong_basis_is_refused(change: dict[str, object], message: str) -> No
     assert text.startswith(message)
 
 
-def test_components_must_agree() -> None:
+def test_inconsistent_components_are_refused() -> None:
     component = ShapeComponent(1.0, np.vstack([TABLE, TABLE[:2]]), np.zeros((0, 9, 3)), 0.1)
     half = replace(component, weight=0.5)
     with pytest.raises(InputError, match=r"weights sum to 0\.5, not to 1"):
@@ -410,8 +412,8 @@ def test_components_must_agree() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("category", ["chair", "mug"])
-def test_real_models_that_were_held_out_are_likely(real_data: Path, category: str) -> None:
-    """A keypoint follows from the others: its error is far below its deviation in the category."""
+def test_held_out_real_models_are_likely(real_data: Path, category: str) -> None:
+    """Keypoints predicted from the others have errors far below the category's deviations."""
     dataset = KeypointNet(real_data / "keypointnet")
     model = ShapeModel.from_dataset(dataset, category, split="train", components=1)
     component = model.components[0]
@@ -434,8 +436,8 @@ def test_real_models_that_were_held_out_are_likely(real_data: Path, category: st
     assert (np.abs(whitened) < 2).mean() > 0.88
 
 
-def test_a_mirror_is_learned_only_of_a_category_that_is_symmetric() -> None:
-    """Chairs whose front differs from their back are no chairs once these are exchanged."""
+def test_a_mirror_is_learned_only_for_a_symmetric_category() -> None:
+    """Front and back of chairs differ, so a mirror that exchanges them is not learned."""
     rows = np.array([each.points_3d for each in tables(20)])
     box = np.stack([rows.min(axis=1), rows.max(axis=1)], axis=1)
     completed = np.concatenate([rows, box], axis=1)

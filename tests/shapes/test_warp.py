@@ -1,4 +1,4 @@
-"""Warping: exact at keypoints, the identity and stretches kept, degenerate keypoints allowed."""
+"""Warping: exact keypoints, identity, stretches and degenerate keypoints."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ def keypoints(seed: int, count: int) -> FloatArray:
     return np.random.default_rng(seed).uniform(0, 1, (count, 3))
 
 
-def with_points(points: FloatArray) -> Mesh:
-    """The cube with further vertices at the keypoints."""
+def add_vertices(points: FloatArray) -> Mesh:
+    """Add vertices at points to the cube."""
     rows = 8 + np.arange(len(points))
     faces = np.vstack([CUBE.faces, np.column_stack([rows, rows, rows])])
     return Mesh(np.vstack([CORNERS, points]), faces)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 20), st.floats(0.001, 0.5))
-def test_keypoints_come_to_their_targets(seed: int, count: int, moved: float) -> None:
+def test_keypoints_move_to_their_targets(seed: int, count: int, moved: float) -> None:
     source = keypoints(seed, count)
     target = source + np.random.default_rng(seed + 1).normal(0, moved, source.shape)
-    warped = warp_mesh(with_points(source), source, target, **STILL)
+    warped = warp_mesh(add_vertices(source), source, target, **STILL)
     assert warped.vertices[8:] == pytest.approx(target, abs=1e-6)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12))
-def test_keypoints_that_stay_leave_the_mesh(seed: int, count: int) -> None:
+def test_fixed_keypoints_give_the_identity(seed: int, count: int) -> None:
     source = keypoints(seed, count)
     assert warp_mesh(CUBE, source, source, **STILL).vertices == pytest.approx(CORNERS, abs=1e-9)
 
 
-def test_many_keypoints_carry_a_stretch_to_the_whole_mesh() -> None:
+def test_a_stretch_of_many_keypoints_stretches_the_mesh() -> None:
     stretch = np.array([1, 2, 0.5])
     warped = warp_mesh(CUBE, CORNERS, CORNERS * stretch, bounds=[[0, 0, 0], stretch])
     assert warped.vertices == pytest.approx(CORNERS * stretch, abs=1e-9)
@@ -64,17 +64,17 @@ def test_the_mesh_about_fills_the_bounds() -> None:
 def test_keypoints_in_a_plane_a_line_or_a_point(axes: list[int]) -> None:
     source = keypoints(0, 6) * axes
     target = source + keypoints(1, 6) * axes * 0.1 + 0.1
-    warped = warp_mesh(with_points(source), source, target, **STILL)
+    warped = warp_mesh(add_vertices(source), source, target, **STILL)
     expected = target if any(axes) else np.full_like(target, 0.1)
     assert warped.vertices[8:] == pytest.approx(expected, abs=1e-6)
     assert np.abs(warped.vertices[:8] - CORNERS).max() < 0.5
 
 
-def test_coincident_keypoints_come_to_the_mean_of_their_targets() -> None:
+def test_coincident_keypoints_move_to_the_mean_of_their_targets() -> None:
     source = np.vstack([keypoints(0, 4), keypoints(0, 1)])
     target = source.copy()
     target[0, 0] += 0.1
-    warped = warp_mesh(with_points(source), source, target, **STILL)
+    warped = warp_mesh(add_vertices(source), source, target, **STILL)
     assert warped.vertices[8] == pytest.approx(source[0] + [0.05, 0, 0], abs=1e-6)
 
 
@@ -103,13 +103,13 @@ def test_refusals() -> None:
 
 
 @pytest.mark.slow
-def test_a_real_chair_becomes_another_without_folds(real_data: Path) -> None:
+def test_a_real_chair_is_warped_to_another_without_folds(real_data: Path) -> None:
     chairs = KeypointNet(real_data / "keypointnet")["chair"]
     model = next(each for each in chairs if each.mesh_path is not None)
     mesh = model.load_mesh()
     low, high = mesh.bounds
     grid = np.stack(np.meshgrid(*np.linspace(low, high, 8).T, indexing="ij"), axis=-1)
-    cloud = with_points(grid.reshape(-1, 3))
+    cloud = add_vertices(grid.reshape(-1, 3))
     for other in chairs[:40:8]:
         ids, mine, theirs = np.intersect1d(
             model.keypoints.ids, other.keypoints.ids, return_indices=True

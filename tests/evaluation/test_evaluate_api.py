@@ -77,9 +77,9 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         evaluate(tmp_path / "none", "correspondences")
     with pytest.raises(InputError, match="unknown option of keypointnet 'nois_px', did you mean"):
         evaluate(tmp_path, nois_px=1.0)
-    with pytest.raises(InputError, match="root: is not given; keypointnet cannot do without"):
+    with pytest.raises(InputError, match="root: is missing; keypointnet needs it"):
         evaluate(None)
-    with pytest.raises(InputError, match="sweep: is not given"):
+    with pytest.raises(InputError, match="sweep: is missing"):
         evaluate(experiment="simulate")
 
 

@@ -317,7 +317,7 @@ class TestPage:
     [
         (("--methods", "best"), "--methods: unknown method 'best'"),
         (("--methods", "rigid+mask+mask"), "--methods: unknown method 'rigid+mask+mask'"),
-        (("--methods", "truth+mask"), "--methods: truth takes keypoints alone"),
+        (("--methods", "truth+mask"), "--methods: truth uses keypoints only"),
         (("--methods", "shape"), "--methods: unknown method 'shape'"),
     ],
 )

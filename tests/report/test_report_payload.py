@@ -401,7 +401,7 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
     found = report(tmp_path, tmp_path / "run")
     assert found["tables"] is None
     assert found["title"] == "Simulation of noise"
-    assert found["headline"]["group"] == "noise of the keypoints [px]"
+    assert found["headline"]["group"] == "keypoint noise [px]"
     assert [row["category"] for row in found["headline"]["rows"]] == ["1"] * 3 + ["4"] * 3
     plot = found["plots"][0]
     assert (plot["id"], plot["x"]["unit"], plot["y"]["log"]) == ("rotation_error_deg", "px", True)

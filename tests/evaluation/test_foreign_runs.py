@@ -89,29 +89,28 @@ def cut_timings(run: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
 
-_ANEW = "; remove it and start the same run again: what is missing is done anew"
+_ANEW = "; remove it and start the same run again: it is computed again"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (foreign, f"not a table of such a run: there is no column 'points'{_ANEW}"),
-        (without_method, f"not a table of such a run: there is no column 'method'{_ANEW}"),
+        (foreign, f"not a valid table of a run: column 'points' is missing{_ANEW}"),
+        (without_method, f"not a valid table of a run: column 'method' is missing{_ANEW}"),
         (twice, None),
         (
             changed("rotation_error_deg", "large"),
-            "not a table of such a run: the column 'rotation_error_deg' is of the type 'string', "
+            "not a valid table of a run: column 'rotation_error_deg' has the type 'string', "
             f"not 'double'{_ANEW}",
         ),
         (
             changed("method", None),
-            f"not a table of such a run: the column 'method' is of the type 'null', not "
-            f"'string'{_ANEW}",
+            f"not a valid table of a run: column 'method' has the type 'null', not 'string'{_ANEW}",
         ),
         (
             changed("method", None, pa.string()),
-            f"not a table of such a run: the column 'method' has empty cells{_ANEW}",
+            f"not a valid table of a run: column 'method' has empty cells{_ANEW}",
         ),
         (cut_short, None),
     ],
@@ -125,7 +124,7 @@ def test_a_foreign_or_damaged_table_of_results_is_refused(
 ) -> None:
     change(run)
     line = refusal_line(capsys, "report", run)
-    assert line.startswith(f"{run / 'results.parquet'}: not a table ")
+    assert line.startswith(f"{run / 'results.parquet'}: ")
     assert line.endswith(_ANEW)
     if text is not None:
         assert line == f"{run / 'results.parquet'}: {text}"
@@ -155,7 +154,7 @@ def test_an_unfinished_run_with_a_missing_part_is_shown(
     capsys.readouterr()
     (part,) = (run / "parts").iterdir()
     pq.write_table(pa.table({"a": [1]}), part)
-    assert "there is no column 'points'" in refusal_line(capsys, "report", run)
+    assert "column 'points' is missing" in refusal_line(capsys, "report", run)
     # Parts of another, longer run.
     shutil.copy(halved / "parts" / part.name, part)
     shutil.copy(part, run / "parts" / "0000900.parquet")

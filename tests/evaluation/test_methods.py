@@ -56,9 +56,9 @@ def test_what_a_bad_function_does_is_its_own_failure(bad: Any) -> None:
 
 
 def test_functions_without_a_name_of_their_own_are_refused() -> None:
-    with pytest.raises(InputError, match="a function that is called <lambda> has no name"):
+    with pytest.raises(InputError, match="a function named <lambda> cannot head a column"):
         simulate([lambda a, b, c: None])
-    with pytest.raises(InputError, match="'linear' is the name of more than one"):
+    with pytest.raises(InputError, match="the name 'linear' is already in use"):
         simulate([linear, partial(linear)])
 
 
@@ -67,9 +67,9 @@ def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
 
     def rigid(model: Any, views: Any) -> Any: ...
 
-    with pytest.raises(InputError, match="'shape' is the name of more than one; give the func"):
+    with pytest.raises(InputError, match="the name 'shape' is already in use; rename"):
         cadalign.evaluate(tmp_path, "unseen", methods=[shape])
-    with pytest.raises(InputError, match="'rigid' is the name of more than one; give the func"):
+    with pytest.raises(InputError, match="the name 'rigid' is already in use; rename"):
         PhotosOptions(tmp_path, methods=(rigid,))  # type: ignore[arg-type]
 
 

@@ -144,7 +144,7 @@ def test_names_of_columns_are_refused(sample_root: Path, name: str) -> None:
         return 0.0
 
     function.__name__ = name
-    with pytest.raises(InputError, match=f"metrics: '{name}' is the name of more than one; give"):
+    with pytest.raises(InputError, match=f"metrics: the name '{name}' is already in use; rename"):
         cadalign.evaluate(sample_root, metrics=[function], workers=0)
 
 

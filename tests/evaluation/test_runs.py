@@ -85,7 +85,7 @@ def test_a_worker_that_dies_once_costs_nothing_but_a_retry(tmp_path: Path) -> No
 
 @pytest.mark.long
 def test_workers_that_cannot_live_end_the_run_with_a_reason(tmp_path: Path) -> None:
-    with pytest.raises(CadalignError, match="die before they finish anything"):
+    with pytest.raises(CadalignError, match="die before they finish a chunk"):
         run_squares(tmp_path, Squares(dead_on_arrival=True), workers=1)
 
 
@@ -191,7 +191,7 @@ def test_a_run_of_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_results_without_a_run_file_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "results.parquet").touch()
-    with pytest.raises(DataError, match="holds results, but no run"):
+    with pytest.raises(DataError, match="holds results but no run"):
         run_squares(tmp_path, Squares())
 
 

@@ -174,7 +174,7 @@ class TestMethods:
         assert [row["reason"] for row in rows[3:]] == [
             "",
             "the object has no mask",
-            "the direction of gravity is not known",
+            "the direction of gravity is unknown",
         ]
 
     def test_few_keypoints_are_left_out(self, tmp_path: Path) -> None:

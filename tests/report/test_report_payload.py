@@ -430,7 +430,7 @@ BEGUN = '{"experiment": "keypointnet", "tasks": 3, "chunk_size": 1}'
         ({}, "not the folder of a run: it has no run.json; give a folder"),
         ({"run.json": '{"experiment": "brewing"}'}, "no report on a run of 'brewing'; known are k"),
         ({"run.json": "{"}, "not valid JSON"),
-        ({"run.json": BEGUN}, "nothing of the run is finished yet; wait, or start the same command"),
+        ({"run.json": BEGUN}, "nothing of the run is finished yet; wait, or start the same"),
         ({"run.json": BEGUN, "results.parquet": "no table"}, "the table cannot be read"),
     ],
 )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError, unknown
 from cadalign.evaluation.methods import check_names
-from cadalign.evaluation.options import ExperimentOptions, absolute_paths, tuples
+from cadalign.evaluation.options import ExperimentOptions, absolute_paths, as_tuples
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.engine import OnProgress, Workers, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
@@ -86,8 +86,8 @@ def evaluate(
         if isinstance(options[name], str) or callable(options[name]):
             options[name] = (options[name],)
     kind = spec_named(experiment).options
-    _check_given(kind, experiment, source, options)
-    chosen = kind(*source, **tuples(options))
+    _check_options(kind, experiment, source, options)
+    chosen = kind(*source, **as_tuples(options))
     with ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
@@ -98,7 +98,7 @@ def evaluate(
         return frame.assign(seconds=done.cells["seconds"])
 
 
-def _check_given(
+def _check_options(
     kind: type[ExperimentOptions], experiment: str, source: Sequence[object], given: Collection[str]
 ) -> None:
     """Raise InputError for an unknown option, or a missing one without a default."""

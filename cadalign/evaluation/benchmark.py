@@ -73,18 +73,20 @@ class Setting:
 
     def _cases(self, task: Any) -> list[Case]:
         found = attempt(self.case, task)
-        return [replace(self.failed(task), error=found) if isinstance(found, Exception) else found]
+        return [
+            replace(self.failed_case(task), error=found) if isinstance(found, Exception) else found
+        ]
 
-    def failed(self, task: Any) -> Case:
+    def failed_case(self, task: Any) -> Case:
         """The case of a task that could not be evaluated, without an instance."""
         return Case(task.names)
 
-    def given(self, instance: Any) -> MethodInput:
+    def method_input(self, instance: Any) -> MethodInput:
         """The input of general methods; by default the instance itself."""
         found: MethodInput = instance
         return found
 
-    def answered(self, method: Method, instance: Any, answer: Any) -> Any:
+    def estimate_of(self, method: Method, instance: Any, answer: Any) -> Any:
         """Convert a general method's alignment or result to the estimate that is measured."""
         return answer
 
@@ -112,7 +114,7 @@ class Benchmark:
     metrics: tuple[FunctionMetric, ...] = ()  # metrics of users' functions
 
     @classmethod
-    def chosen(
+    def of(
         cls,
         setting: Setting,
         methods: Iterable[str],
@@ -159,7 +161,7 @@ class Benchmark:
 
     def failure(self, task: Any, reason: str) -> list[Row]:
         """One failed row per method."""
-        case = self.setting.failed(task)
+        case = self.setting.failed_case(task)
         return [
             self._blank
             | Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
@@ -174,13 +176,13 @@ class Benchmark:
     def _answers(self, method: Method, cases: Sequence[Case]) -> list[tuple[Outcome, Any]]:
         """Outcome of a method for every case, with its estimate or an error."""
         instances = [case.instance for case in cases if case.instance is not None]
-        solved = self._solved(method, instances)
+        solved = self._solve(method, instances)
         pairs = [
             (instance, estimate)
             for instance, (estimate, _) in zip(instances, solved, strict=True)
             if not isinstance(estimate, Exception)
         ]
-        estimates, rows = iter(solved), iter(self._measured(method, pairs))
+        estimates, rows = iter(solved), iter(self._measure(method, pairs))
         answers: list[tuple[Outcome, Any]] = []
         for case in cases:
             estimate: Any = case.error or ValueError("there is no instance")
@@ -196,45 +198,45 @@ class Benchmark:
                 answers.append((Outcome(names, case.facts | row, seconds=seconds), estimate))
         return answers
 
-    def _measured(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+    def _measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Cells of each estimate, users' metrics included, or an error."""
         rows = self.setting.measure(method, pairs) if pairs else []
         if not self.metrics:
             return rows
         return [
-            row if isinstance(row, Exception) else attempt(self._further, row, *pair)
+            row if isinstance(row, Exception) else attempt(self._measure_metrics, row, *pair)
             for pair, row in zip(pairs, rows, strict=True)
         ]
 
-    def _further(self, row: Row, instance: Any, estimate: Any) -> Row:
-        given = self.setting.given(instance)
+    def _measure_metrics(self, row: Row, instance: Any, estimate: Any) -> Row:
+        given = self.setting.method_input(instance)
         return row | {each.metric.key: each.measure(estimate, given) for each in self.metrics}
 
-    def _solved(self, method: Method, instances: Sequence[Any]) -> list[tuple[Any, float | None]]:
+    def _solve(self, method: Method, instances: Sequence[Any]) -> list[tuple[Any, float | None]]:
         """A method's estimate of every instance, or an error, and the seconds."""
         if method.name not in self.batched or method.solve_many is None:
-            return [self._timed(method, instance) for instance in instances]
+            return [self._solve_one(method, instance) for instance in instances]
         start = time.perf_counter()
-        answers = method.solve_many([self.setting.given(each) for each in instances])
+        answers = method.solve_many([self.setting.method_input(each) for each in instances])
         found = [
             answer
             if isinstance(answer, Exception)
-            else self.setting.answered(method, instance, answer)
+            else self.setting.estimate_of(method, instance, answer)
             for instance, answer in zip(instances, answers, strict=True)
         ]
         share = (time.perf_counter() - start) / max(len(instances), 1)
         return [(estimate, share) for estimate in found]
 
-    def _timed(self, method: Method, instance: Any) -> tuple[Any, float | None]:
+    def _solve_one(self, method: Method, instance: Any) -> tuple[Any, float | None]:
         """A method's estimate of one instance, or an error, and the seconds."""
-        given = attempt(self.setting.given, instance) if method.is_general else instance
+        given = attempt(self.setting.method_input, instance) if method.is_general else instance
         if isinstance(given, Exception):
             return given, None
         start = time.perf_counter()
         answer = attempt(method.solve, given)
         seconds = time.perf_counter() - start
         if method.is_general and not isinstance(answer, Exception):
-            answer = attempt(self.setting.answered, method, instance, answer)
+            answer = attempt(self.setting.estimate_of, method, instance, answer)
         return answer, seconds
 
 

@@ -171,7 +171,7 @@ def _bound(given: MethodInput) -> Alignment:
 
 
 @lru_cache(maxsize=64)
-def imported(text: str, *, where: str) -> Callable[..., Any]:
+def import_function(text: str, *, where: str) -> Callable[..., Any]:
     """Import ``module:function``, also from the working directory.
 
     Raises InputError if the module cannot be imported, or lacks the function.
@@ -194,8 +194,8 @@ def imported(text: str, *, where: str) -> Callable[..., Any]:
     return function
 
 
-def _loaded(function: Function, where: str) -> Callable[..., Any]:
-    return imported(function, where=where) if isinstance(function, str) else function
+def _load(function: Function, where: str) -> Callable[..., Any]:
+    return import_function(function, where=where) if isinstance(function, str) else function
 
 
 def check_names(functions: Iterable[Function], taken: Container[str], where: str) -> None:
@@ -214,17 +214,17 @@ def check_names(functions: Iterable[Function], taken: Container[str], where: str
 
 def _answer_of(given: MethodInput, *, function: Function) -> Alignment | Result:
     """Call a user's method and check what it returns."""
-    loaded = _loaded(function, "methods")
+    loaded = _load(function, "methods")
     told = {"sigma": given.sigma} if _takes_sigma(loaded) else {}
     # Copies, as the function may modify its arguments.
     arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
     try:
-        return _checked_answer(loaded(*arguments, **told))
+        return _check_answer(loaded(*arguments, **told))
     except SystemExit as error:
         raise CadalignError(f"it called sys.exit ({error})") from None
 
 
-def _checked_answer(answer: object) -> Alignment | Result:
+def _check_answer(answer: object) -> Alignment | Result:
     """Return the alignment or result; raises InputError if it is neither, or invalid."""
     from cadalign.estimation.result import Result
 
@@ -258,11 +258,11 @@ def choose_methods(
         Method(name_of(each), partial(_answer_of, function=each), is_general=True)
         if is_function(each)
         else table[each]
-        for each in checked_methods(chosen, own)
+        for each in validate_methods(chosen, own)
     )
 
 
-def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -> tuple[Any, ...]:
+def validate_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -> tuple[Any, ...]:
     """Check names and functions and drop repeated ones; see `choose_methods`."""
     known = fit_methods() if own is None else own
     found = tuple(dict.fromkeys(chosen))
@@ -274,7 +274,7 @@ def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -
             raise unknown("method", each, known, where="methods")
     check_names(filter(is_function, found), known, "methods")
     for function in filter(is_function, found):
-        _loaded(function, "methods")
+        _load(function, "methods")
     return found
 
 
@@ -294,7 +294,7 @@ class FunctionMetric:
         """Make a metric; raises InputError for an unknown required parameter."""
         if not is_function(function):
             raise InputError(f"{quote(function)} is no function", where="metrics", fix=_FIX)
-        parameters = inspect.signature(_loaded(function, "metrics")).parameters.values()
+        parameters = inspect.signature(_load(function, "metrics")).parameters.values()
         variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
         required = [p.name for p in parameters if p.default is p.empty and p.kind not in variable]
         others = [name for name in required if name not in _ARGUMENTS]
@@ -318,7 +318,7 @@ class FunctionMetric:
         known = {**vars(given), "est": pose_of(estimate), "result": result}
         arguments = {name: known[name] for name in self.parameters}
         try:
-            value = _loaded(self.function, "metrics")(**arguments)
+            value = _load(self.function, "metrics")(**arguments)
         except Exception as error:
             raise InputError(f"{type(error).__name__}: {error}", where=where) from None
         if value is None or (is_real(value) and value != value):

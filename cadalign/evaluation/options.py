@@ -93,7 +93,7 @@ def name_of(function: Function) -> str:
     """The name of a function in tables; for a callable object, its class's name."""
     if isinstance(function, str):
         return function.rpartition(":")[2].rpartition(".")[2]
-    function = _innermost(function)
+    function = _unwrap_partial(function)
     return str(getattr(function, "__name__", type(function).__name__))
 
 
@@ -101,12 +101,12 @@ def text_of(function: Function) -> str:
     """The import path ``module:function`` of a function, for a run's configuration."""
     if isinstance(function, str):
         return function
-    function = _innermost(function)
+    function = _unwrap_partial(function)
     name = getattr(function, "__qualname__", type(function).__qualname__)
     return f"{function.__module__}:{name}"
 
 
-def _innermost(function: Any) -> Any:
+def _unwrap_partial(function: Any) -> Any:
     """The function inside nested functools.partial objects."""
     while isinstance(function, partial):
         function = function.func
@@ -140,9 +140,9 @@ class FunctionOptions(ExperimentOptions):
 
     def check_methods(self, own: tuple[str, ...] | None = None) -> None:
         """Check methods and drop repeated ones; ``own`` are the experiment's method names."""
-        from cadalign.evaluation.methods import checked_methods
+        from cadalign.evaluation.methods import validate_methods
 
-        self.replace_values(methods=checked_methods(getattr(self, "methods", ()), own))
+        self.replace_values(methods=validate_methods(getattr(self, "methods", ()), own))
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def absolute_paths(value: T) -> T:
     return cast(T, found)
 
 
-def tuples(options: dict[str, Any]) -> dict[str, Any]:
+def as_tuples(options: dict[str, Any]) -> dict[str, Any]:
     """Convert iterables among options to tuples, except for strings."""
     return {
         name: value if isinstance(value, str) or not hasattr(value, "__iter__") else tuple(value)

@@ -17,7 +17,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
-from cadalign.evaluation.summary import Summary, known, where
+from cadalign.evaluation.summary import Summary, drop_nan, select_rows
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def _draw_lines(axes: Axes, plot: Plot) -> None:
         )
 
 
-def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
+def cumulative_plot(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
     """Plot the share of objects with at most an error, or at least an overlap, by method.
 
     ``metric`` is a column of the result tables. Failures count as misses; rows that were left out,
@@ -166,7 +166,7 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
     words = "at least this overlap" if metric.better == HIGH else "at most this error"
 
     def shares(rows: Cells) -> FloatArray:
-        errors = known(rows[metric.key][rows["status"] == OK])
+        errors = drop_nan(rows[metric.key][rows["status"] == OK])
         count = len(errors) + int((rows["status"] == FAILED).sum())
         return np.asarray(is_within(errors, places[:, None]).sum(axis=1) / max(count, 1))
 
@@ -174,7 +174,7 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
         Trace.of(index, method, places.tolist(), shares(rows).tolist(), metrics.COVERED)
         for index, run in enumerate(runs)
         for method in run.methods
-        for rows in [where(run.cells, run.cells["method"] == method)]
+        for rows in [select_rows(run.cells, run.cells["method"] == method)]
     ]
     return Plot(
         id=f"within_{metric.key}",
@@ -189,9 +189,9 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
 def cumulative_curves(
     runs: Sequence[Run], *, curves: Sequence[tuple[Metric, FloatArray]], of: str
 ) -> list[Plot]:
-    """Cumulative plots of the metrics that some run has; see `cumulative`."""
+    """Cumulative plots of the metrics that some run has; see `cumulative_plot`."""
     return [
-        cumulative(runs, metric, places, title=f"{metric.label} {of}")
+        cumulative_plot(runs, metric, places, title=f"{metric.label} {of}")
         for metric, places in curves
-        if any(len(known(run.cells[metric.key])) for run in runs)
+        if any(len(drop_nan(run.cells[metric.key])) for run in runs)
     ]

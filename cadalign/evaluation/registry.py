@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import DataError, InputError, quote, unknown
-from cadalign.evaluation.metrics import CATEGORY, Metric, told
+from cadalign.evaluation.metrics import CATEGORY, Metric, has_values
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plot
 from cadalign.evaluation.runs.work import COLUMNS, SKIPPED, Columns, Plan
@@ -114,7 +114,7 @@ class Spec:
         """
         further = {metric.key: metric for run in runs for metric in run.metrics}
         chosen = (*(self.columns if columns is None else columns), *further.values())
-        return [c for c in chosen if told(c, [line.number(c.key) for line in lines])]
+        return [c for c in chosen if has_values(c, [line.number(c.key) for line in lines])]
 
     def write(self, run: Run) -> Summaries:
         """Write ``summary.csv`` and ``figures`` of a finished run."""

@@ -121,9 +121,9 @@ def summarize(
         labels = [f"category {each}" if each == ALL else each for each in values]
         labels = [ALL if each is None else each for each in labels]
         for method in run.methods:
-            rows = where(cells, chosen & (cells["method"] == method))
-            rated = where(rows, rows["status"] != apart)
-            group = Group(rated, where(rated, rated["status"] == OK))
+            rows = select_rows(cells, chosen & (cells["method"] == method))
+            rated = select_rows(rows, rows["status"] != apart)
+            group = Group(rated, select_rows(rated, rated["status"] == OK))
             counts = [len(each["method"]) for each in (rows, *group)]
             if not counts[0]:
                 continue
@@ -169,12 +169,12 @@ def group_name(group: Metric, value: Any) -> str:
     return value if isinstance(value, str) else f"{group.factor * value:g}"
 
 
-def where(cells: Cells, chosen: npt.NDArray[np.bool_]) -> Cells:
+def select_rows(cells: Cells, chosen: npt.NDArray[np.bool_]) -> Cells:
     """Select rows by a mask (n,)."""
     return {name: column[chosen] for name, column in cells.items()}
 
 
-def known(values: npt.NDArray[Any]) -> FloatArray:
+def drop_nan(values: npt.NDArray[Any]) -> FloatArray:
     """The values (n,) that are not missing."""
     numbers = values.astype(float)
     return np.asarray(numbers[~np.isnan(numbers)])
@@ -182,11 +182,11 @@ def known(values: npt.NDArray[Any]) -> FloatArray:
 
 def median_of(values: npt.NDArray[Any]) -> float:
     """Median of the values (n,) that are not missing; NaN if all are."""
-    found = known(values)
+    found = drop_nan(values)
     return float(np.median(found)) if len(found) else np.nan
 
 
 def mean_of(values: npt.NDArray[Any]) -> float:
     """Mean of the values (n,) that are not missing; NaN if all are."""
-    found = known(values)
+    found = drop_nan(values)
     return float(found.mean()) if len(found) else np.nan

@@ -17,7 +17,7 @@ from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
 from cadalign import Camera, RansacOptions
 from cadalign.datasets import Colmap, Correspondences, KeypointNet
-from cadalign.evaluation.experiments.correspondences import errors_of, spoil
+from cadalign.evaluation.experiments.correspondences import errors_of, make_problem
 from cadalign.evaluation.methods import MethodInput
 
 _POINTS = 8
@@ -108,7 +108,7 @@ def _ransac(given: BenchmarkData) -> Iterator[Row]:
         for draw in range(given.count or 20):
             options = RansacOptions(**_SEARCH, max_iterations=iterations, seed=draw)
             for image in images:
-                truth = spoil(image, share, rng=rng)
+                truth = make_problem(image, share, rng=rng)
                 problem = truth.points_3d, truth.points_2d, truth.camera
                 call = partial(section.attempt, cadalign.fit, *problem, ransac=options)
                 wall, _, result = section.clocked(call)

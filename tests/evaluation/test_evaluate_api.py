@@ -16,7 +16,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import prepared
 from cadalign.evaluation.instances.instance import make_instance
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.options import tuples
+from cadalign.evaluation.options import as_tuples
 from cadalign.evaluation.registry import known_options, spec_named
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.render import Scene
@@ -86,7 +86,7 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
 def test_lists_of_options_become_tuples() -> None:
     given = {"a": [1, 2], "b": range(2), "c": "ab", "d": Path("x"), "e": None, "f": 1.5, "g": len}
     kept = {name: given[name] for name in "cdefg"}
-    assert tuples(given) == {"a": (1, 2), "b": (0, 1), **kept}
+    assert as_tuples(given) == {"a": (1, 2), "b": (0, 1), **kept}
 
 
 def test_translation_errors_are_in_diagonals_of_the_model(sample_root: Path) -> None:

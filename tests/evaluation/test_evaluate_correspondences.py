@@ -22,7 +22,7 @@ from cadalign.evaluation.experiments.correspondences import (
     SPEC,
     CorrespondenceOptions,
     errors_of,
-    spoil,
+    make_problem,
     summarize_shares,
 )
 from cadalign.evaluation.methods import MethodInput
@@ -119,7 +119,7 @@ def test_formats_are_recognised(tmp_path):
 class TestInputs:
     def test_only_the_given_share_is_moved_and_the_rest_is_the_image(self):
         seen = seen_image("a", 1)
-        problem = spoil(seen, 0.35, rng=np.random.default_rng(0))
+        problem = make_problem(seen, 0.35, rng=np.random.default_rng(0))
         wrong = problem.outliers
         assert wrong.sum() == 21
         np.testing.assert_array_equal(problem.points_2d[~wrong], seen.points_2d[~wrong])
@@ -127,7 +127,7 @@ class TestInputs:
 
     def test_the_true_alignment_puts_the_stretched_points_where_they_were(self):
         seen = seen_image("a", 1)
-        problem = spoil(seen, 0.5, rng=np.random.default_rng(0))
+        problem = make_problem(seen, 0.5, rng=np.random.default_rng(0))
         np.testing.assert_allclose(
             problem.alignment.apply(problem.points_3d),
             seen.cam_from_world.apply(seen.points_3d),
@@ -150,7 +150,7 @@ class TestInputs:
         seen = Correspondences("a", seen.points_3d, points_2d, camera, pose)
         rng = np.random.default_rng(0)
         moved = np.concatenate(
-            [p.points_2d[p.outliers] for p in (spoil(seen, 0.9, rng=rng) for _ in range(20))]
+            [p.points_2d[p.outliers] for p in (make_problem(seen, 0.9, rng=rng) for _ in range(20))]
         )
         assert camera.contains(moved, margin=0.5).all()
         assert camera.normalize_where_valid(moved)[1].all()

@@ -19,7 +19,7 @@ from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.methods import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
-from cadalign.evaluation.plots import cumulative
+from cadalign.evaluation.plots import cumulative_plot
 
 
 def simulate(**options: Any) -> Any:
@@ -196,5 +196,5 @@ def test_curves_count_small_errors_and_large_overlaps(
         metric.key: np.array([1.0, 1.0, 3.0, np.nan]),
     }
     run: Any = SimpleNamespace(methods=("mine",), cells=cells)
-    (trace,) = cumulative([run], metric, np.array(places), title="").traces
+    (trace,) = cumulative_plot([run], metric, np.array(places), title="").traces
     assert list(trace.y) == shares

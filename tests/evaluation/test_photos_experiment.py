@@ -30,8 +30,8 @@ from cadalign.evaluation.api import run
 from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions, summarize_objects
 from cadalign.evaluation.instances.photos import PhotoEstimate, PhotoObjects
-from cadalign.evaluation.instances.pictures import cut_out
-from cadalign.evaluation.instances.sighting import Sighting, annotations_of, opened, photo_tasks
+from cadalign.evaluation.instances.pictures import crop_photo
+from cadalign.evaluation.instances.sighting import Sighting, annotations_of, photo_tasks, photos_of
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
@@ -56,12 +56,12 @@ OWN = {
 @pytest.fixture(autouse=True)
 def _fresh() -> None:
     """Data sets are listed once in a process; tests change them."""
-    opened.cache_clear()
+    photos_of.cache_clear()
 
 
 def done(root: Path, out: Path, **options: Any) -> Run:
     """A finished run."""
-    opened.cache_clear()
+    photos_of.cache_clear()
     run(PhotosOptions(root, **options), RunFolder(out), workers=0, dask=None)
     return SPEC.open(out)
 
@@ -245,7 +245,7 @@ class TestRuns:
     @pytest.mark.parametrize("kind", WRITERS)
     def test_every_file_of_annotations_counts(self, tmp_path: Path, kind: str) -> None:
         WRITERS[kind](tmp_path / "data")
-        dataset = opened(tmp_path / "data")
+        dataset = photos_of(tmp_path / "data")
         seen = {annotations_of(dataset, photo_tasks(dataset, None))}
         ends = (".json", ".txt", ".mat")
         files = [path for path in dataset.root.rglob("*") if path.suffix in ends]
@@ -341,7 +341,7 @@ def test_a_thumb_shows_an_object_with_a_margin_and_has_its_camera() -> None:
     photo = np.zeros((480, 640, 3), np.uint8)
     photo[200:261, 300:401] = 255
     corners = np.array([[300.0, 200.0], [400.0, 260.0]])
-    thumb, near = cut_out(photo, camera, corners)
+    thumb, near = crop_photo(photo, camera, corners)
     assert (near.width, near.height) == thumb.shape[1::-1]
     rows, columns = np.nonzero(thumb[..., 0] > 128)
     assert (columns.max() - columns.min()) / near.width == pytest.approx(1 / 1.4, abs=0.02)

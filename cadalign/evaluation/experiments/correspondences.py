@@ -126,7 +126,7 @@ class CorrespondenceTask(NamedTuple):
         return {"image": self.image, "draw": self.draw, "outliers": self.outliers}
 
 
-_opened = lru_cache(maxsize=1)(open_correspondences)
+_images_of = lru_cache(maxsize=1)(open_correspondences)
 """The images of a folder, read once per process."""
 
 
@@ -158,21 +158,21 @@ _REDRAWS = 100
 
 
 @dataclass(frozen=True)
-class SpoiledImages(Setting):
+class ImageProblems(Setting):
     """Instances of the experiment: stretched scenes with outliers."""
 
     columns = COLUMNS
 
     options: CorrespondenceOptions
 
-    def failed(self, task: CorrespondenceTask) -> Case:
+    def failed_case(self, task: CorrespondenceTask) -> Case:
         return Case(task.names, {"success": False})
 
     def case(self, task: CorrespondenceTask) -> Case:
-        seen = _opened(self.options.path)[task.image]
+        seen = _images_of(self.options.path)[task.image]
         names = (task.image, str(task.draw), repr(task.outliers))
         rng = instance_rng(self.options.seed, *names)
-        truth = spoil(seen, task.outliers, rng=rng)
+        truth = make_problem(seen, task.outliers, rng=rng)
         ransac = replace(_SEARCH, seed=int(rng.integers(2**31)))
         facts = {"points": len(seen), "success": False}
         return Case(task.names, facts, MethodInput.of_problem(truth, 1.0, ransac=ransac))
@@ -191,7 +191,9 @@ def errors_of(found: Alignment | Result, given: MethodInput) -> Row:
     return {"points": len(given.points_3d), **errors, "success": is_success}
 
 
-def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -> SimulatedProblem:
+def make_problem(
+    seen: Correspondences, outliers: float, *, rng: np.random.Generator
+) -> SimulatedProblem:
     """Stretch the scene of an image and move a share of its points to random pixels.
 
     The model is the scene with y and z divided by scales s_y and s_z in [0.5, 2]. The true
@@ -278,11 +280,11 @@ _CHUNK = 8
 
 def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[CorrespondenceTask]:
     """Plan a run over the images of a model or data set."""
-    _opened.cache_clear()  # the files may have changed in this session
-    images = _opened(options.path)
+    _images_of.cache_clear()  # the files may have changed in this session
+    images = _images_of(options.path)
     tasks = correspondence_tasks(images, options)
     more = {"loader": type(images).__name__, "correspondences": _fingerprint(Path(images.root))}
-    benchmark = Benchmark.chosen(SpoiledImages(options), options.methods, metrics=options.metrics)
+    benchmark = Benchmark.of(ImageProblems(options), options.methods, metrics=options.metrics)
     return benchmark.plan(options, tasks, chunk=_CHUNK, **more)
 
 

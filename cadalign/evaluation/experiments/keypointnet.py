@@ -147,7 +147,7 @@ class KeypointViews(Setting):
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
         return [
-            replace(self.failed(task), error=instance)
+            replace(self.failed_case(task), error=instance)
             if isinstance(instance, Exception)
             else self._case(task, instance)
             for task, instance in zip(tasks, self._instances(tasks), strict=True)
@@ -164,7 +164,7 @@ class KeypointViews(Setting):
         }
         return Case(task.names, facts, (task, instance))
 
-    def failed(self, task: KeypointTask) -> Case:
+    def failed_case(self, task: KeypointTask) -> Case:
         return Case(task.names, {} if task.problem else {"symmetry": str(task.symmetry)})
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
@@ -177,12 +177,12 @@ class KeypointViews(Setting):
             if task.problem:
                 return DataError(task.problem)
             return (
-                next(of_hulls) if task.model is None else attempt(partial(_with_mesh, task, **how))
+                next(of_hulls) if task.model is None else attempt(partial(_mesh_view, task, **how))
             )
 
         return list(map(made, tasks))
 
-    def given(self, view: KeypointView) -> MethodInput:
+    def method_input(self, view: KeypointView) -> MethodInput:
         _, found = view
         keypoints = found.points_3d, found.points_2d, found.camera
         return MethodInput(*keypoints, self.options.sigma, bounds=found.bounds, gt=found.gt)
@@ -211,7 +211,7 @@ def _draw(folder: RunFolder, view: KeypointView, estimate: Any) -> None:
     write_picture(draw_instance, folder, instance, estimate, *task.names.values())
 
 
-def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
+def _mesh_view(task: KeypointTask, **how: Any) -> Instance:
     assert task.model is not None
     return make_instance(task.model, scene=scene_of(task.model), view_index=task.view, **how)
 
@@ -221,7 +221,7 @@ def keypointnet_benchmark(
 ) -> Benchmark:
     """The benchmark of the chosen methods on views of models."""
     setting = KeypointViews(options, drawn_in)
-    found = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
+    found = Benchmark.of(setting, options.methods, metrics=options.metrics)
     batched = frozenset(each.name for each in found.methods if not each.has_statistics)
     return replace(found, batched=batched)
 

@@ -167,9 +167,9 @@ _CHUNK = 8
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.instances.photos import photos_benchmark
-    from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, reopened
+    from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, reload_photos
 
-    dataset = reopened(options.root)
+    dataset = reload_photos(options.root)
     tasks = photo_tasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     return photos_benchmark(options, pictures).plan(

@@ -37,7 +37,7 @@ from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.summary import (
     Group,
     Summary,
-    known,
+    drop_nan,
     mean_of,
     median,
     medians,
@@ -188,7 +188,7 @@ class RetrievalQueries(Setting):
     options: RetrievalRunOptions
 
     def case(self, task: RetrievalTask) -> Case:
-        library = opened_library(self.library)
+        library = open_library(self.library)
         model = library[task.category, task.model_id]
         same_shapes(library, model.key)  # cached, so that no query is timed with it
         query = observe_model(model, task, seed=self.options.seed)
@@ -198,7 +198,7 @@ class RetrievalQueries(Setting):
         """Rank of the true model, and errors of the first match."""
         from cadalign.retrieval.absence import shape_distance
 
-        (task, query), library, first = instance, opened_library(self.library), matches[0]
+        (task, query), library, first = instance, open_library(self.library), matches[0]
         gt = library[task.category, task.model_id]
         alike = same_shapes(library, gt.key)
         gt_box = Box.from_model(gt.bounds, query.gt)
@@ -226,7 +226,7 @@ def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark
 
 
 def _retrieve(instance: RetrievalInstance, *, library: str) -> list[Match]:
-    (task, query), opened = instance, opened_library(library)
+    (task, query), opened = instance, open_library(library)
     leaves_out = task.protocol == LEAVE_OUT
     return opened.retrieve(
         query.points_2d,
@@ -242,7 +242,7 @@ def _retrieve(instance: RetrievalInstance, *, library: str) -> list[Match]:
 
 
 @lru_cache(maxsize=2)
-def opened_library(path: str | Path) -> Library:
+def open_library(path: str | Path) -> Library:
     """Open a library, once per process."""
     from cadalign.retrieval.library import Library
 
@@ -270,7 +270,7 @@ HEADLINE = (
 )
 
 
-def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group], float]:
+def _rank_statistic(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group], float]:
     """Mean of a function of the leave-in ranks, which are NaN beyond `TOP`."""
 
     def made(group: Group) -> float:
@@ -281,9 +281,9 @@ def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group]
 
 
 _STATISTICS = {
-    "rank_1": _of_ranks(lambda ranks: (ranks == 1).astype(float)),
-    "reciprocal_rank": _of_ranks(lambda ranks: np.nan_to_num(1 / ranks)),
-    "none": lambda group: mean_of(known(group.solved["none_probability"]) > 0.5),
+    "rank_1": _rank_statistic(lambda ranks: (ranks == 1).astype(float)),
+    "reciprocal_rank": _rank_statistic(lambda ranks: np.nan_to_num(1 / ranks)),
+    "none": lambda group: mean_of(drop_nan(group.solved["none_probability"]) > 0.5),
     **medians(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
     "rotation_error_deg": median("rotation_error_deg"),
     "milliseconds": milliseconds,

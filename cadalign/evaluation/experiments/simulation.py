@@ -203,10 +203,10 @@ class SweepProblems(Setting):
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
     """The benchmark of a sweep, whose methods solve problems in batches."""
     setting, batched = SweepProblems(kind.name, seed), frozenset(kind.methods)
-    return Benchmark.chosen(setting, kind.methods, metrics=metrics, batched=batched)
+    return Benchmark.of(setting, kind.methods, metrics=metrics, batched=batched)
 
 
-def kind_of(run: Run) -> SweepKind:
+def sweep_of(run: Run) -> SweepKind:
     """The sweep of a run, with default settings."""
     name = str(run.config.get("sweep"))
     if name not in SWEEPS:
@@ -215,21 +215,21 @@ def kind_of(run: Run) -> SweepKind:
     return SWEEPS[name]
 
 
-def varied(run: Run) -> Metric:
+def varied_quantity(run: Run) -> Metric:
     """The varied quantity of a run."""
     known = {each.key: each for each in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
-    return known[kind_of(run).column]
+    return known[sweep_of(run).column]
 
 
 def summarize_sweep(run: Run) -> list[Summary]:
     """Medians of every metric per value and method, over the solved problems."""
-    name = partial(group_name, varied(run))
-    return summarize(run, medians(*ERRORS), by=(kind_of(run).column,), name=name)
+    name = partial(group_name, varied_quantity(run))
+    return summarize(run, medians(*ERRORS), by=(sweep_of(run).column,), name=name)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Plots of errors against the varied quantity."""
-    x, found = varied(runs[0]), [summarize_sweep(run) for run in runs]
+    x, found = varied_quantity(runs[0]), [summarize_sweep(run) for run in runs]
     return [
         plot_against(found, x, metric, place=x.key, note="medians")
         for metric in (*ERRORS, *runs[0].metrics)
@@ -252,9 +252,9 @@ SPEC = Spec(
     columns=(metrics.INSTANCES, metrics.FAILED, *ERRORS),
     results=COLUMNS,
     summarize=summarize_sweep,
-    group=varied,
+    group=varied_quantity,
     plots=plots,
-    kind=lambda run: f"simulation of {kind_of(run).name}",
+    kind=lambda run: f"simulation of {sweep_of(run).name}",
     subject="problems of the AEPnP paper's simulation",
     note="Medians over the problems that did not fail.",
 )

@@ -22,7 +22,7 @@ from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, fingerprint
 from cadalign.evaluation.summary import (
     Group,
-    known,
+    drop_nan,
     mean,
     mean_of,
     medians,
@@ -101,16 +101,16 @@ HEADLINE = (
 )
 
 
-def _within(level: str, nominal: float) -> Callable[[Group], float]:
+def _coverage_share(level: str, nominal: float) -> Callable[[Group], float]:
     """Share of the known levels up to the nominal one; NaN if none is known."""
-    return lambda group: mean_of((known(group.solved[level]) <= nominal).astype(float))
+    return lambda group: mean_of((drop_nan(group.solved[level]) <= nominal).astype(float))
 
 
 _STATISTICS = {
     "keypoints": mean("keypoints"),
     **medians(*_MEDIANS),
     **{
-        f"{name}_in_{percent}": _within(f"{name}_level", percent / 100)
+        f"{name}_in_{percent}": _coverage_share(f"{name}_level", percent / 100)
         for name in ("rotation", "stretch")
         for percent in (68, 95)
     },

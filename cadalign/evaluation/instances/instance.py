@@ -292,8 +292,8 @@ def make_instance(
     xyz = model.keypoints.xyz
     view = sample_view(scene, xyz, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
     ids = model.keypoints.ids
-    seen = _Seen(view.cam_from_model, xyz[view.visible], ids[view.visible], scene.bounds, rng)
-    (instance,) = _stretched([seen], noise_px=noise_px, scene=scene)
+    seen = _View(view.cam_from_model, xyz[view.visible], ids[view.visible], scene.bounds, rng)
+    (instance,) = _stretch([seen], noise_px=noise_px, scene=scene)
     return instance
 
 
@@ -309,15 +309,15 @@ def make_hull_instances(
     hulls = [each.hull for each in views]
     sampled = sample_hull_views(hulls, KEYPOINT_CAMERA, rngs=rngs, min_visible=min_visible)
     seen = [
-        _Seen(found[0], each.hull.xyz[found[1]], each.ids[found[1]], each.hull.bounds, rng)
+        _View(found[0], each.hull.xyz[found[1]], each.ids[found[1]], each.hull.bounds, rng)
         for each, rng, found in zip(views, rngs, sampled, strict=True)
         if not isinstance(found, TooFewVisibleError)
     ]
-    instances = iter(_stretched(seen, noise_px=noise_px, scene=None))
+    instances = iter(_stretch(seen, noise_px=noise_px, scene=None))
     return [e if isinstance(e, TooFewVisibleError) else next(instances) for e in sampled]
 
 
-class _Seen(NamedTuple):
+class _View(NamedTuple):
     """The visible keypoints (n, 3) of a model, and its bounds (2, 3)."""
 
     cam_from_model: Alignment
@@ -327,7 +327,7 @@ class _Seen(NamedTuple):
     rng: np.random.Generator
 
 
-def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) -> list[Instance]:
+def _stretch(views: Sequence[_View], *, noise_px: float, scene: Scene | None) -> list[Instance]:
     if not views:
         return []
     low, high = STRETCH_RANGE

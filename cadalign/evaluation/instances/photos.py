@@ -49,8 +49,8 @@ from cadalign.evaluation.instances.sighting import (
     PhotoTarget,
     PhotoTask,
     Sighting,
-    opened,
-    sight,
+    make_sighting,
+    photos_of,
     targets_of,
 )
 from cadalign.evaluation.methods import Method, MethodInput
@@ -93,7 +93,7 @@ def estimate_object(sighting: Sighting, *, method: str) -> PhotoEstimate:
             raise LeftOutError("the true pose is unknown")
         return PhotoEstimate(gt, box)
     if base == EPNP:
-        given = sighting.given
+        given = sighting.input
         found = fit(given.points_3d, given.points_2d, given.camera, method="epnp")
         return estimate_of_model(found.alignment, sighting)
     model = _model(base, sighting, with_mesh=bool(_OUTLINED & evidence))
@@ -139,7 +139,7 @@ def _view(sighting: Sighting, evidence: Collection[str]) -> View:
         if photo.image is None:
             raise LeftOutError("the photo's file is missing")
         given["image"] = photo.read_image()
-    seen = sighting.given
+    seen = sighting.input
     return View(seen.camera, seen.points_2d, ids=sighting.names, sigma=seen.sigma, **given)
 
 
@@ -177,17 +177,17 @@ class PhotoObjects(Setting):
         return found
 
     def _case(self, target: PhotoTarget) -> Case:
-        protocol = protocol_of(opened(self.options.root).kind)
-        sighting = attempt(partial(sight, target, protocol))
+        protocol = protocol_of(photos_of(self.options.root).kind)
+        sighting = attempt(partial(make_sighting, target, protocol))
         if isinstance(sighting, Exception):
             return Case(target.names, error=sighting)
         facts = {"keypoints": len(sighting.names)}
         return Case(target.names, facts, sighting)
 
-    def given(self, sighting: Sighting) -> MethodInput:
-        return sighting.given
+    def method_input(self, sighting: Sighting) -> MethodInput:
+        return sighting.input
 
-    def answered(
+    def estimate_of(
         self, method: Method, sighting: Sighting, answer: Alignment | Result
     ) -> PhotoEstimate:
         if isinstance(answer, Alignment):
@@ -208,13 +208,13 @@ class PhotoObjects(Setting):
             write_picture(draw_sighting, self.drawn_in, sighting, last)
         return record_of(
             outcomes,
-            [_described(each, sighting) for each in estimates],
-            camera=sighting.given.camera,
+            [_describe(each, sighting) for each in estimates],
+            camera=sighting.input.camera,
             gt=sighting.target.gt,
             stretch=np.ones(3),
             bounds=sighting.bounds,
             points_3d=sighting.points_3d,
-            points_2d=sighting.given.points_2d,
+            points_2d=sighting.input.points_2d,
             ids=np.arange(len(sighting.names)),
         )
 
@@ -227,7 +227,7 @@ def photos_benchmark(options: PhotosOptions, drawn_in: RunFolder) -> Benchmark:
         if not is_function(name)
     }
     setting = PhotoObjects(options, drawn_in)
-    return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
+    return Benchmark.of(setting, options.methods, own, metrics=options.metrics)
 
 
 def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
@@ -236,12 +236,12 @@ def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
         residuals = found.result.residuals
     else:
         points = found.alignment.apply(sighting.points_3d)
-        residuals = sighting.given.camera.project_where_ahead(points) - sighting.given.points_2d
+        residuals = sighting.input.camera.project_where_ahead(points) - sighting.input.points_2d
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else np.nan
     return rms if np.isfinite(rms) else None
 
 
-def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | Any:
+def _describe(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | Any:
     """Convert an estimate for the record; errors are unchanged."""
     if not isinstance(estimate, PhotoEstimate):
         return estimate
@@ -253,7 +253,7 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
         np.arange(len(model)),
         model.xyz,
         model_bounds=sighting.bounds,
-        sigma=sighting.given.sigma,
+        sigma=sighting.input.sigma,
         result=result,
     )
 
@@ -263,13 +263,13 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
 
     A missing photo is drawn grey.
     """
-    names, camera, scene = sighting.target.names, sighting.given.camera, sighting.target.scene
+    names, camera, scene = sighting.target.names, sighting.input.camera, sighting.target.scene
     stem = record_stem(names["category"], names["model_id"])
     try:
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
     boxes = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
-    write_pictures(folder, stem, photo, camera, observed=sighting.given.points_2d, **boxes)
+    write_pictures(folder, stem, photo, camera, observed=sighting.input.points_2d, **boxes)
     if scene is not None:
         write_preview(folder.previews / f"{stem}.json", scene.mesh)

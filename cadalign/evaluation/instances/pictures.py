@@ -51,14 +51,14 @@ def write_pictures(
     The folder's ``pictures`` gets the photo. ``thumbs`` gets the part around the object and its
     keypoints ``observed`` (n, 2) [px], with the true and the estimated box.
     """
-    small, near = shown_photo(photo, camera)
+    small, near = shrink_photo(photo, camera)
     box = gt_box or est_box
     corners = np.empty((0, 2)) if box is None else near.project_where_ahead(box.corners)
     points = np.concatenate([rescaled_pixels(observed, near.width / camera.width), corners])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         points = np.array([[0, 0], [near.width, near.height]], dtype=float)
-    crop, crop_camera = cut_out(small, near, points)
+    crop, crop_camera = crop_photo(small, near, points)
     boxes: dict[str, Any] = {"gt_box": gt_box, "est_box": est_box}
     thumb = draw_overlay(crop, crop_camera, axes=False, legend=False, **boxes)
     write_webp(folder.pictures / f"{stem}.webp", small)
@@ -92,7 +92,7 @@ def draw_instance(
         write_preview(preview, instance.scene.mesh)
 
 
-def shown_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
+def shrink_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
     """Shrink a photo to at most 1024 pixels on its longer side; returns it and its camera."""
     factor = min(1.0, _MOST / max(camera.width, camera.height))
     size = tuple(max(1, round(factor * length)) for length in (camera.width, camera.height))
@@ -101,7 +101,7 @@ def shown_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
     return photo, camera.resized(*size)
 
 
-def cut_out(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteImage, Camera]:
+def crop_photo(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteImage, Camera]:
     """Crop a photo around points (n, 2) [px] to a thumb; returns it and its camera."""
     limit = np.array([camera.width, camera.height], dtype=float)
     low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)

@@ -109,12 +109,12 @@ def record_of(
     record = {
         "camera": {name: getattr(camera, name) for name in _CAMERA},
         "gt": None if gt is None else _pose(gt),
-        "stretch": _rounded(stretch),
-        "bounds": _rounded(bounds),
-        "points_3d": _rounded(points_3d),
-        "points_2d": _rounded(points_2d, _PIXEL_DIGITS),
+        "stretch": _round(stretch),
+        "bounds": _round(bounds),
+        "points_3d": _round(points_3d),
+        "points_2d": _round(points_2d, _PIXEL_DIGITS),
         "semantic_ids": ids.tolist(),
-        "estimates": list(map(_described, outcomes, estimates)),
+        "estimates": list(map(_describe, outcomes, estimates)),
     }
     return _ENCODER.encode(record).decode()
 
@@ -130,7 +130,7 @@ def record_stem(category: str, model_id: str, view: int = 0) -> str:
     return stem if view == 0 else f"{stem}_{view}"
 
 
-def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
+def _describe(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
     method = outcome.names["method"]
     if not outcome.is_ok or isinstance(estimate, Exception):
         return {"method": method, "reason": outcome.reason}
@@ -155,7 +155,7 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
 def _pose(alignment: Alignment) -> dict[str, Any]:
     # One call for speed, as there are many estimates.
     packed = [alignment.rotation.ravel(), alignment.translation, alignment.scale]
-    values = _rounded(np.concatenate(packed))
+    values = _round(np.concatenate(packed))
     return {"rotation": values[:9], "translation": values[9:12], "scale": values[12:]}
 
 
@@ -164,8 +164,8 @@ def _warp(estimate: object) -> dict[str, Any]:
     if not isinstance(estimate, AlignedShape):
         return {}
     ends = {"from": estimate.source, "to": estimate.target}
-    return {"warp": {name: _rounded(points, _WARP_DIGITS) for name, points in ends.items()}}
+    return {"warp": {name: _round(points, _WARP_DIGITS) for name, points in ends.items()}}
 
 
-def _rounded(values: FloatArray, digits: int = _MODEL_DIGITS) -> Any:
+def _round(values: FloatArray, digits: int = _MODEL_DIGITS) -> Any:
     return values.round(digits).tolist()

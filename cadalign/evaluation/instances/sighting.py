@@ -71,14 +71,14 @@ def annotations_of(dataset: PhotoDataset, tasks: Sequence[PhotoTask]) -> str:
     return fingerprint(repr(tasks), fingerprint_of_files(dataset.annotation_files()))
 
 
-opened = lru_cache(maxsize=1)(open_photos)
+photos_of = lru_cache(maxsize=1)(open_photos)
 """The data set of a folder, listed once per process."""
 
 
-def reopened(root: Path) -> PhotoDataset:
+def reload_photos(root: Path) -> PhotoDataset:
     """List a data set again, as its files may have changed in this session."""
-    opened.cache_clear()
-    return opened(root)
+    photos_of.cache_clear()
+    return photos_of(root)
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def targets_of(task: PhotoTask, root: Path, *, pictures: int) -> list[PhotoTarge
     """Objects of a photo, and cases without an instance for unreadable parts."""
     if task.problem:
         return [Case(task.names, error=DataError(task.problem))]
-    dataset = opened(root)
+    dataset = photos_of(root)
     try:
         photo = dataset[task.index]
     except DataError as error:
@@ -200,10 +200,10 @@ class Sighting:
     bounds: FloatArray  # (2, 3), the model's box, in its own unit
     width: float  # factor that scales the model to the object's width
     protocol: Protocol  # of the data set
-    given: MethodInput  # with the model scaled to the object's width
+    input: MethodInput  # with the model scaled to the object's width
 
 
-def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
+def make_sighting(target: PhotoTarget, protocol: Protocol) -> Sighting:
     """Make the instance of an object.
 
     Raises LeftOutError if the object has no camera, no model, or too few keypoints, and DataError
@@ -218,7 +218,7 @@ def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
     marks = target.found.keypoints
     if marks is None or model is None:
         raise LeftOutError("there are no keypoints")
-    names, pixels = _marked(marks, model)
+    names, pixels = _shared_marks(marks, model)
     if len(names) < _LEAST_KEYPOINTS:
         raise LeftOutError(f"{len(names)} keypoints are fewer than {_LEAST_KEYPOINTS}")
     bounds, gt = target.bounds, target.gt
@@ -235,11 +235,11 @@ def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
         bounds=bounds,
         width=width,
         protocol=protocol,
-        given=given if camera.focal_known else _calibrated(given),
+        input=given if camera.focal_known else _estimate_focal(given),
     )
 
 
-def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
+def _shared_marks(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
     """The visible keypoints that the model also has, and their pixels."""
     good = np.isin(marks.names, model.names)
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
@@ -253,7 +253,7 @@ def _sigma(target: PhotoTarget, protocol: Protocol) -> float:
     return max(_SIGMA_OF_SIDE * float(max(right - left, bottom - top)), _LEAST_PX)
 
 
-def _calibrated(given: MethodInput) -> MethodInput:
+def _estimate_focal(given: MethodInput) -> MethodInput:
     found = fit(
         given.points_3d,
         given.points_2d,

@@ -150,7 +150,7 @@ def unseen_benchmark(learned: Path, options: UnseenOptions) -> Benchmark:
     """The benchmark of the chosen methods on unseen objects."""
     own = {name: Method(name, partial(solve_object, method=name)) for name in METHODS}
     setting = UnseenObjects(learned, options)
-    return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
+    return Benchmark.of(setting, options.methods, own, metrics=options.metrics)
 
 
 # Errors -------------------------------------------------------------------------------------------
@@ -171,7 +171,7 @@ class UnseenObjects(Setting):
         facts = {"keypoints": len(seen.points_2d)}
         return Case(task.names, facts, replace(seen, learned=self.learned))
 
-    def given(self, seen: UnseenObject) -> MethodInput:
+    def method_input(self, seen: UnseenObject) -> MethodInput:
         shape = seen.shape
         known = np.isin(seen.ids, shape.ids)
         points = shape.mean[shape.rows(seen.ids[known].tolist())]
@@ -184,7 +184,7 @@ class UnseenObjects(Setting):
             gt=seen.gt,
         )
 
-    def answered(
+    def estimate_of(
         self, method: Method, seen: UnseenObject, answer: Alignment | Result
     ) -> ShapeEstimate:
         shape = seen.shape
@@ -202,7 +202,7 @@ class UnseenObjects(Setting):
         seen: UnseenObject = case.instance
         return record_of(
             outcomes,
-            [e if isinstance(e, Exception) else _described(e, seen) for e in estimates],
+            [e if isinstance(e, Exception) else _describe(e, seen) for e in estimates],
             camera=KEYPOINT_CAMERA,
             gt=seen.gt,
             bounds=seen.task.hull.bounds,
@@ -277,7 +277,7 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
     }
 
 
-def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
+def _describe(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
     known, rows = _shared(found, seen)
     return aligned_shape(
         found,

@@ -48,9 +48,9 @@ class Metric:
 
     def text(self, value: Any) -> str:
         """Convert a value to the unit and format it; a dash if it is missing or not finite."""
-        return self.rounded(self.shown(value))
+        return self.format(self.shown(value))
 
-    def rounded(self, shown: float | None) -> str:
+    def format(self, shown: float | None) -> str:
         """Format a value in the unit; a dash for None."""
         if shown is None:
             return "-"
@@ -67,7 +67,7 @@ class Metric:
         return {"key": self.key, "label": self.head, **rest}
 
 
-def told(metric: Metric, numbers: Sequence[float | None]) -> bool:
+def has_values(metric: Metric, numbers: Sequence[float | None]) -> bool:
     """True if a column has a number to show; missing ones are None or NaN."""
     known = [number for number in numbers if number is not None and not np.isnan(number)]
     return any(known) if metric == SKIPPED else bool(known)
@@ -84,7 +84,7 @@ def rate(key: str, label: str, symbol: str = "", *, head: str = "", **look: Any)
     return Metric(key, label, "%", factor=100.0, head=head, symbol=symbol, log=False, **shown)
 
 
-def _like(metric: Metric, key: str, label: str, head: str = "", symbol: str = "") -> Metric:
+def _copy_as(metric: Metric, key: str, label: str, head: str = "", symbol: str = "") -> Metric:
     head = head or label
     return replace(metric, key=key, label=label, head=head, symbol=symbol or head)
 
@@ -93,7 +93,7 @@ INSTANCES = Metric("instances", "instances", digits=0, better=None, symbol="n")
 FAILED = Metric("failed", "failed", digits=0, better=None)
 SKIPPED = Metric("skipped", "skipped", digits=0, better=None, symbol="skip")
 """Shown only if instances were skipped."""
-LEFT_OUT = _like(FAILED, "left_out", "left out", symbol="out")
+LEFT_OUT = _copy_as(FAILED, "left_out", "left out", symbol="out")
 KEYPOINTS = Metric("keypoints", "keypoints", digits=1, better=None, symbol="kpts")
 
 ROTATION = Metric("rotation_error_deg", "rotation error", "deg", 3, head="R error", symbol="R deg")
@@ -110,9 +110,9 @@ TRANSLATION_OF_DISTANCE = replace(
 SCALE_Y = Metric(
     "scale_y_error", "scale error s_y", "%", factor=100.0, head="s_y error", symbol="s_y %"
 )
-SCALE_Z = _like(SCALE_Y, "scale_z_error", "scale error s_z", "s_z error", "s_z %")
+SCALE_Z = _copy_as(SCALE_Y, "scale_z_error", "scale error s_z", "s_z error", "s_z %")
 BOX_IOU = Metric("box_iou", "box IoU", digits=3, better=HIGH, symbol="IoU", log=False)
-TRANSLATION_UP_TO_SCALE = _like(
+TRANSLATION_UP_TO_SCALE = _copy_as(
     TRANSLATION,
     "translation_error_up_to_scale",
     "translation error, up to scale",
@@ -120,13 +120,13 @@ TRANSLATION_UP_TO_SCALE = _like(
     "t diag scaled",
 )
 """The estimate is first scaled about the camera centre: one image does not determine the size."""
-BOX_IOU_UP_TO_SCALE = _like(
+BOX_IOU_UP_TO_SCALE = _copy_as(
     BOX_IOU, "box_iou_up_to_scale", "box IoU, up to scale", symbol="IoU scaled"
 )
 RMS = Metric("rms_px", "reprojection error", "px", symbol="rms px")
 
 # Relative to the nearest of the poses that symmetry makes equal to the truth.
-SYM_ROTATION = _like(
+SYM_ROTATION = _copy_as(
     ROTATION, "sym_rotation_error_deg", "rotation error, symmetry-aware", "R error, sym.", "R deg*"
 )
 SYM_TRANSLATION = replace(

@@ -23,7 +23,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap
 from cadalign.evaluation.runs.work import Row
-from cadalign.evaluation.summary import Group, known, medians
+from cadalign.evaluation.summary import Group, drop_nan, medians
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
@@ -50,7 +50,7 @@ class Rate:
 
     def of(self, group: Group) -> float:
         """The share in a group; failures count as misses."""
-        values = known(group.solved[self.column.key])
+        values = drop_nan(group.solved[self.column.key])
         count = len(values) + len(group.rows["method"]) - len(group.solved["method"])
         within = values > 0 if self.limit is None else values < self.limit
         return int(within.sum()) / count if count else np.nan
@@ -78,7 +78,7 @@ def statistics_of(cells: Cells) -> Statistics:
 
     Shares are left out if their column is empty in ``cells``.
     """
-    shares = {rate.metric.key: rate.of for rate in RATES if len(known(cells[rate.column.key]))}
+    shares = {rate.metric.key: rate.of for rate in RATES if len(drop_nan(cells[rate.column.key]))}
     return {**medians(*MEDIANS), **shares}
 
 

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 from cadalign.arrays import is_whole as is_integer
 from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, InputError, quote
-from cadalign.evaluation.runs.executors import cluster, in_threads, processes
+from cadalign.evaluation.runs.executors import dask_cluster, process_pool, thread_pool
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import SECONDS, read_cells, write_rows, write_tables
 from cadalign.evaluation.runs.work import AbortError, Columns, Experiment, Plan, Row, reason_of
@@ -73,7 +73,7 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
             fix = "pip install 'cadalign[dask]'"
             raise CadalignError("Dask is not installed", where="--dask", fix=fix) from None
         # A lost scheduler cancels all calls; the error comes from the attempt to reconnect.
-        return Workers(partial(cluster, dask), (KilledWorker, CancelledError))
+        return Workers(partial(dask_cluster, dask), (KilledWorker, CancelledError))
     if not is_integer(count) or count < -1:
         raise InputError(
             f"{quote(count)} is not a number of processes",
@@ -81,8 +81,8 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
             fix="give 1 or more, -1 for one per core, or 0 for this process alone",
         )
     if count:
-        return Workers(partial(processes, worker_count(count)), (BrokenProcessPool,))
-    return Workers(partial(in_threads, threads))
+        return Workers(partial(process_pool, worker_count(count)), (BrokenProcessPool,))
+    return Workers(partial(thread_pool, threads))
 
 
 def execute(
@@ -122,7 +122,7 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
     on_progress(Progress(done, len(tasks)))
     chunks = ((index, tasks[starts[index] : starts[index] + size]) for index in missing)
-    for (index, some), rows in evaluated(workers, experiment, chunks):
+    for (index, some), rows in evaluate_chunks(workers, experiment, chunks):
         write_rows(folder.part(index), columns, rows)
         done += len(some)
         on_progress(Progress(done, len(tasks)))
@@ -137,7 +137,7 @@ def _sweep(path: Path) -> None:
 # Chunks -------------------------------------------------------------------------------------------
 
 
-def evaluated(
+def evaluate_chunks(
     workers: Workers, experiment: Experiment[Any], chunks: Iterable[Chunk]
 ) -> Iterator[tuple[Chunk, list[Row]]]:
     """Evaluate chunks and yield each with its rows, in any order.
@@ -147,18 +147,18 @@ def evaluated(
     """
     call = partial(evaluate_chunk, experiment)
     if workers.deaths:
-        call = partial(_evaluate_pickled, _pickled(experiment))
+        call = partial(_evaluate_pickled, _pickle(experiment))
     lost: list[Chunk] = []
-    yield from _pass(workers, call, chunks, lost)
+    yield from _evaluate_once(workers, call, chunks, lost)
     for chunk in lost:
         lost_again: list[Chunk] = []
-        yield from _pass(workers, call, [chunk], lost_again)
+        yield from _evaluate_once(workers, call, [chunk], lost_again)
         if lost_again:
             failures = [experiment.failure(task, KILLED_REASON) for task in chunk[1]]
             yield chunk, [row for rows in failures for row in rows]
 
 
-def _pass(
+def _evaluate_once(
     workers: Workers, call: Callable[..., Any], chunks: Iterable[Chunk], lost: list[Chunk]
 ) -> Iterator[tuple[Chunk, list[Row]]]:
     """Evaluate chunks once; chunks of dead workers are appended to ``lost``."""
@@ -191,7 +191,7 @@ def _pass(
                         reason = reason_of(error)
                         lost.append(chunk)
                     except Exception as error:
-                        raise _cannot_work(error) from error
+                        raise _worker_error(error) from error
                     else:
                         window, deaths = size, 0
                         yield chunk, rows
@@ -204,7 +204,7 @@ def _pass(
             raise CadalignError(what, where="workers", fix=fix)
 
 
-def _cannot_work(error: Exception) -> CadalignError:
+def _worker_error(error: Exception) -> CadalignError:
     return CadalignError(
         f"a worker failed: {reason_of(error)}",
         where="workers",
@@ -225,7 +225,7 @@ def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> list[Row]:
     return [row for task in tasks for row in evaluate_chunk(experiment, [task])]
 
 
-def _pickled(experiment: Experiment[Any]) -> bytes:
+def _pickle(experiment: Experiment[Any]) -> bytes:
     """Pickle an experiment; raises InputError for functions that workers cannot import."""
     try:
         pickled = pickle.dumps(experiment)
@@ -242,8 +242,8 @@ def _pickled(experiment: Experiment[Any]) -> bytes:
 
 
 # One object for all chunks of a process, so that its caches last.
-_unpickled = lru_cache(maxsize=1)(pickle.loads)
+_unpickle = lru_cache(maxsize=1)(pickle.loads)
 
 
 def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> list[Row]:
-    return evaluate_chunk(_unpickled(pickled), tasks)
+    return evaluate_chunk(_unpickle(pickled), tasks)

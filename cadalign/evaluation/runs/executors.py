@@ -25,14 +25,14 @@ _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NU
 
 
 @contextmanager
-def in_threads(count: int) -> Iterator[tuple[Executor, int]]:
+def thread_pool(count: int) -> Iterator[tuple[Executor, int]]:
     """Threads of this process, for functions that release the interpreter lock."""
-    with _cancelling(ThreadPoolExecutor(count)) as executor:
+    with _cancel_at_exit(ThreadPoolExecutor(count)) as executor:
         yield executor, count
 
 
 @contextmanager
-def processes(count: int) -> Iterator[tuple[Executor, int]]:
+def process_pool(count: int) -> Iterator[tuple[Executor, int]]:
     """Processes with one thread each, which do not import this process's main script."""
     main, kept = sys.modules["__main__"], {name: os.environ.get(name) for name in _ENVIRONMENT}
     sys.modules["__main__"] = ModuleType("__main__")
@@ -40,7 +40,7 @@ def processes(count: int) -> Iterator[tuple[Executor, int]]:
     try:
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
-        with _cancelling(pool) as executor:
+        with _cancel_at_exit(pool) as executor:
             yield executor, count + 1
     finally:
         sys.modules["__main__"] = main
@@ -51,7 +51,7 @@ def processes(count: int) -> Iterator[tuple[Executor, int]]:
 
 
 @contextmanager
-def _cancelling(executor: Executor) -> Iterator[Executor]:
+def _cancel_at_exit(executor: Executor) -> Iterator[Executor]:
     """Yield the executor; at the end, cancel pending calls and wait for running ones."""
     try:
         yield executor
@@ -73,7 +73,7 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor, int]]:
+def dask_cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor, int]]:
     """The Dask cluster of a scheduler's address, such as tcp://10.0.0.1:8786.
 
     Workers need the same version of cadalign, and the same folders at the same paths. Dask repeats

@@ -27,7 +27,7 @@ _WRITTEN = ("results.csv", "summary.csv", "report.html", "records.parquet", "tim
 """Files of a run with names that other programs may use, too."""
 
 
-class _Inside:
+class _PathInFolder:
     """The path of a file or folder inside a run's folder."""
 
     def __init__(self, name: str) -> None:
@@ -43,17 +43,17 @@ class RunFolder:
 
     path: Path
 
-    config_file = _Inside("run.json")
-    results = _Inside("results.parquet")
-    timings = _Inside("timings.parquet")
-    records = _Inside("records.parquet")
-    summary = _Inside("summary.csv")
-    figures = _Inside("figures")
-    pictures = _Inside("pictures")
-    thumbs = _Inside("thumbs")
-    previews = _Inside("previews")
-    report = _Inside("report.html")
-    parts = _Inside("parts")
+    config_file = _PathInFolder("run.json")
+    results = _PathInFolder("results.parquet")
+    timings = _PathInFolder("timings.parquet")
+    records = _PathInFolder("records.parquet")
+    summary = _PathInFolder("summary.csv")
+    figures = _PathInFolder("figures")
+    pictures = _PathInFolder("pictures")
+    thumbs = _PathInFolder("thumbs")
+    previews = _PathInFolder("previews")
+    report = _PathInFolder("report.html")
+    parts = _PathInFolder("parts")
 
     @property
     def is_finished(self) -> bool:
@@ -140,8 +140,8 @@ def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[str]:
             yield from _differences(found.get(key), wanted.get(key), inner)
     elif found != wanted:
         there, now = map(json.dumps, (found, wanted))
-        yield f"{name} is {_shortened(there)} there and {_shortened(now)} now"
+        yield f"{name} is {_shorten(there)} there and {_shorten(now)} now"
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

@@ -52,7 +52,7 @@ def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> No
 
     def write(unfinished: Path) -> None:
         with pq.ParquetWriter(unfinished, schema_of(columns), compression="zstd") as writer:
-            for group in _regrouped(tables):
+            for group in _regroup(tables):
                 writer.write_table(group, row_group_size=ROW_GROUP)
 
     write_whole(path, write)
@@ -60,7 +60,7 @@ def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> No
 
 def read_table(path: Path, *, fix: str = DONE_ANEW) -> pa.Table:
     """Read a Parquet file; ``fix`` is the advice of errors."""
-    with _reading(path, fix):
+    with _convert_errors(path, fix):
         # Threads would only cost memory.
         table = pq.read_table(path, use_threads=False)
         # Invalid UTF-8 in names raises only on access; older pyarrow ignores it in the schema.
@@ -71,7 +71,7 @@ def read_table(path: Path, *, fix: str = DONE_ANEW) -> pa.Table:
 
 def read_cells(path: Path, columns: Columns, *, is_record: bool = False) -> pa.Table:
     """Read columns of a chunk; with ``is_record``, only rows with a cell in the last column."""
-    with _reading(path, DONE_ANEW):
+    with _convert_errors(path, DONE_ANEW):
         names = [name for name, _ in columns]
         table = pq.read_table(path, columns=names, use_threads=False)
         if table.schema != schema_of(columns):
@@ -81,7 +81,7 @@ def read_cells(path: Path, columns: Columns, *, is_record: bool = False) -> pa.T
 
 def read_groups(path: Path, *, fix: str) -> Iterator[pa.Table]:
     """Read a Parquet file one row group at a time; raises the errors of `read_table`."""
-    with _reading(path, fix), pq.ParquetFile(path) as file:
+    with _convert_errors(path, fix), pq.ParquetFile(path) as file:
         for index in range(file.num_row_groups):
             table = file.read_row_group(index, use_threads=False)
             table.validate(full=True)
@@ -89,7 +89,7 @@ def read_groups(path: Path, *, fix: str) -> Iterator[pa.Table]:
 
 
 @contextmanager
-def _reading(path: Path, fix: str) -> Iterator[None]:
+def _convert_errors(path: Path, fix: str) -> Iterator[None]:
     try:
         yield
     except (OSError, UnicodeError, pa.ArrowException) as error:
@@ -98,7 +98,7 @@ def _reading(path: Path, fix: str) -> Iterator[None]:
         raise DataError(what, where=str(path), fix=fix) from None
 
 
-def checked(table: pa.Table, columns: Columns, *, path: Path, fix: str) -> pa.Table:
+def check_table(table: pa.Table, columns: Columns, *, path: Path, fix: str) -> pa.Table:
     """Check a table and return it.
 
     Raises DataError if a column is missing or has a wrong type, or a text is missing.
@@ -117,7 +117,7 @@ def checked(table: pa.Table, columns: Columns, *, path: Path, fix: str) -> pa.Ta
     return table
 
 
-def _regrouped(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
+def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
     """Split the rows into tables of `ROW_GROUP` rows; the last one may be shorter."""
     waiting: list[pa.Table] = []
     count = 0
@@ -162,14 +162,14 @@ class Run:
         total, size = int(config.get("tasks", 0)), int(config.get("chunk_size", 1))
         if folder.is_finished:
             table = read_table(folder.results)
-            results = checked(table, columns, path=folder.results, fix=DONE_ANEW)
+            results = check_table(table, columns, path=folder.results, fix=DONE_ANEW)
             return cls(folder, name, config, results, _times(folder, len(results)), total, total)
         parts = [index for index in _parts(folder) if index * size < total]
         if not parts:
             fix = "wait, or start the same command again: the run continues"
             raise DataError("nothing of the run is finished yet", where=str(path), fix=fix)
         done = sum(min(size, total - index * size) for index in parts)
-        table = _joined([folder.part(index) for index in parts], (*columns, *SECONDS))
+        table = _join([folder.part(index) for index in parts], (*columns, *SECONDS))
         own = table.column_names[: table.column_names.index("seconds")]
         return cls(folder, name, config, table.select(own), _seconds(table), done, total)
 
@@ -222,7 +222,7 @@ class Run:
             for table in read_groups(path, fix=_RECORDS_FIX):
                 if not self.is_finished and columns[-1][0] in table.column_names:
                     table = table.filter(table[columns[-1][0]].is_valid())
-                yield from checked(table, columns, path=path, fix=_RECORDS_FIX).to_pylist()
+                yield from check_table(table, columns, path=path, fix=_RECORDS_FIX).to_pylist()
 
     def _record_files(self) -> list[Path]:
         whole = self.folder.records
@@ -235,7 +235,7 @@ def _times(folder: RunFolder, count: int) -> FloatArray:
     """The times of a finished run's rows, NaN if unknown."""
     if folder.timings.is_file():
         timings = read_table(folder.timings, fix=_TIMINGS_FIX)
-        timings = checked(timings, SECONDS, path=folder.timings, fix=_TIMINGS_FIX)
+        timings = check_table(timings, SECONDS, path=folder.timings, fix=_TIMINGS_FIX)
         if len(timings) == count:
             return _seconds(timings)
     return np.full(count, np.nan)
@@ -251,8 +251,8 @@ def _parts(folder: RunFolder) -> list[int]:
     return sorted(int(name) for name in names if name.isdecimal())
 
 
-def _joined(paths: Sequence[Path], columns: Columns) -> pa.Table:
-    tables = [checked(read_table(path), columns, path=path, fix=DONE_ANEW) for path in paths]
+def _join(paths: Sequence[Path], columns: Columns) -> pa.Table:
+    tables = [check_table(read_table(path), columns, path=path, fix=DONE_ANEW) for path in paths]
     for path, table in zip(paths, tables, strict=True):
         if table.schema != tables[0].schema:
             what = f"its columns differ from the columns of {paths[0].name}"

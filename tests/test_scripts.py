@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks import section
-from benchmarks.evidence import SeenObject, aligned, draw_object, moved
+from benchmarks.evidence import SeenObject, align_with, draw_object, move
 from benchmarks.section import BenchmarkData, Row, Tables
 
 from cadalign.cli import main
@@ -78,7 +78,7 @@ def toy(given: BenchmarkData) -> Tables:
         raise DegenerateError(place)
 
     methods = {"fit": lambda place: {"error": len(place) / 4, "good": False}, "none": refused}
-    yield "sizes", section.summaries(section.measured(cases, methods), "method", "place")
+    yield "sizes", section.summaries(section.measure(cases, methods), "method", "place")
     given.folder("keypointnet")
 
 
@@ -98,13 +98,13 @@ class TestSections:
         bench()
         printed = capsys.readouterr().out
         assert "| fit | near | 1 | 1 (1) | 0 |\n| fit | far | 2 | 0.75 (0.75) | 0 |" in printed
-        assert "the rest of toy is left out: give --data, or CADALIGN_DATA" in printed
+        assert "the rest of toy is skipped: give --data, or set CADALIGN_DATA" in printed
 
     @pytest.mark.parametrize(
         ("name", "message"),
         [
-            ("toy", "toy: give --data, or CADALIGN_DATA"),
-            ("nothing", "no section nothing; known are toy"),
+            ("toy", "toy: give --data, or set CADALIGN_DATA"),
+            ("nothing", "unknown section nothing; known are toy"),
         ],
     )
     def test_a_named_section_must_run(
@@ -126,7 +126,7 @@ class TestEvidenceWithoutNoise:
         points = np.asarray(car.model.points_3d)
         for view in car.views:
             motion = np.asarray(view.cam_from_rig)
-            seen = moved(car.instance.gt, motion).apply(points[np.asarray(view.ids)])
+            seen = move(car.instance.gt, motion).apply(points[np.asarray(view.ids)])
             np.testing.assert_allclose(KEYPOINT_CAMERA.project(seen), view.points_2d, atol=1e-8)
         rows, columns = np.nonzero(car.mask("exact"))
         pixels = np.asarray(car.views[0].points_2d)
@@ -140,7 +140,7 @@ class TestEvidenceWithoutNoise:
     )
     def test_bound_is_that_of_the_estimate(self, car: SeenObject, kind: str) -> None:
         """The estimate is the truth, where the inverse of the information is the bound."""
-        result = aligned(kind, car)
+        result = align_with(kind, car)
         assert rotation_error(est=result.alignment, gt=car.instance.gt) < 1e-3
         stated, bound = (
             np.sqrt(each.diagonal()) for each in (result.covariance, result.fisher_covariance)

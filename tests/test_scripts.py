@@ -1,4 +1,4 @@
-"""The scripts start, and the worked example's files are what its page says."""
+"""Scripts start, and the worked example agrees with its page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SCRIPTS = sorted(
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Run a script in this process; gives its exit code."""
+    """Run a script in this process and return its exit code."""
 
     def run_script(script: Path, *arguments: str) -> int:
         monkeypatch.setattr(sys, "argv", [str(script), *arguments])
@@ -83,7 +83,7 @@ def toy(given: BenchmarkData) -> Tables:
 
 
 class TestSections:
-    """`bench.py` with a section of three cases and two methods, the second of which refuses all."""
+    """`bench.py` with a section of three cases and two methods; the second one always fails."""
 
     @pytest.fixture
     def bench(self, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
@@ -138,8 +138,8 @@ class TestEvidenceWithoutNoise:
         "kind",
         ["keypoints", "gravity", "length", "depth", "views-2", "views-2-free"],
     )
-    def test_bound_is_that_of_the_estimate(self, car: SeenObject, kind: str) -> None:
-        """The estimate is the truth, where the inverse of the information is the bound."""
+    def test_the_estimate_states_the_bound(self, car: SeenObject, kind: str) -> None:
+        """Without noise the estimate is the truth, and the inverse information is the bound."""
         result = align_with(kind, car)
         assert rotation_error(est=result.alignment, gt=car.instance.gt) < 1e-3
         stated, bound = (

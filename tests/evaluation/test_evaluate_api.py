@@ -1,4 +1,4 @@
-"""`cadalign.evaluate`: every experiment that the command line has, with the same options."""
+"""`cadalign.evaluate`: all experiments of the command line, with the same options."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_translation_errors_are_in_diagonals_of_the_model(sample_root: Path) -> 
         instance = make_instance(
             some, scene=scene, noise_px=0.5, min_visible=6, seed=0, view_index=0
         )
-        # The object's, as the image shows it, and not the stretched model's.
+        # The diagonal of the original model, not of the stretched one.
         assert instance.diagonal == pytest.approx(size, rel=1e-6)
         fitted = cadalign.fit(instance.points_3d, instance.points_2d, instance.camera)
         errors = alignment_errors(est=fitted.alignment, gt=instance.gt, length=instance.diagonal)

@@ -150,7 +150,7 @@ def test_pictures_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
 
 @pytest.mark.slow
 def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Path) -> None:
-    """As the Cramer-Rao bound may state one, at much noise."""
+    """With much noise, the Cramer-Rao bound has such estimates."""
     model = next(iter(KeypointNet(sample_root)))
     scene = load_scene(model)
     instance = make_instance(model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=scene)

@@ -1,4 +1,4 @@
-"""Folders of runs whose files are damaged, missing, or another program's."""
+"""Folders of runs with damaged, missing or foreign files."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(finished: Path, tmp_path: Path) -> Path:
-    """A copy of the sweep that may be changed."""
+    """A copy of the sweep, which tests may change."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 @pytest.fixture(scope="module")
 def halved(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep with one of its two chunks."""
+    """A sweep with one of two chunks finished."""
     path = tmp_path_factory.mktemp("halved") / "run"
 
     def stop(progress: Progress) -> None:
@@ -54,7 +54,7 @@ def halved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def changed(column: str, value: Any, kind: pa.DataType | None = None) -> Change:
-    """Give another column to the table of results."""
+    """Replace a column of the result table."""
 
     def change(run: Path) -> None:
         table = pq.read_table(run / "results.parquet")
@@ -128,7 +128,7 @@ def test_a_foreign_or_damaged_table_of_results_is_refused(
     assert line.endswith(_ANEW)
     if text is not None:
         assert line == f"{run / 'results.parquet'}: {text}"
-    # The advice works.
+    # Following the advice repairs the run.
     (run / "results.parquet").unlink()
     do_run(SWEEP, RunFolder(run), workers=0, dask=None)
     assert (run / "results.parquet").read_bytes() == (finished / "results.parquet").read_bytes()

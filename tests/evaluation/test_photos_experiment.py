@@ -50,7 +50,7 @@ OWN = {
     "Scan2CAD": {"rotation_error_deg", "box_iou", "scan2cad_aligned", "scan2cad_aligned_axes"},
     "PASCAL3D+": {"rotation_error_deg"},
 }
-"""Some metrics of each data set's own."""
+"""Metrics by data set."""
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ class TestTruth:
 
     @pytest.mark.parametrize("kind", WRITERS)
     def test_is_found_from_the_keypoints_alone(self, tmp_path: Path, kind: str) -> None:
-        """Where models are exact, keypoints too: what methods are given fits the truth."""
+        """With exact models, the keypoints of methods fit the truth."""
         WRITERS[kind](tmp_path / "data")
         method = "stretched" if kind == "Scan2CAD" else "rigid"
         found = done(tmp_path / "data", tmp_path / "run", methods=(method,))
@@ -98,7 +98,7 @@ class TestTruth:
 
 
 def score_poses(dataset: PhotoDataset, poses: dict[tuple[str, str], Alignment]) -> list[Any]:
-    """Rows of a method that gives poses by photo and object, and fails on other objects."""
+    """Rows of a method with given poses by photo and object, which fails on other objects."""
 
     def given(sighting: Sighting) -> PhotoEstimate:
         target = sighting.target
@@ -118,9 +118,9 @@ def summarize_rows(rows: list[Any]) -> list[Summary]:
     return summarize_objects(run)
 
 
-class TestMadeUpErrors:
+class TestSyntheticErrors:
     def test_have_the_scores_of_their_definitions(self, tmp_path: Path) -> None:
-        """A box moved by 30 mm in depth, and one turned by 90 degrees about an axis."""
+        """A box moved by 30 mm in depth, and a box rotated by 90 degrees about an axis."""
         dataset = cadalign.datasets.open(write_scan2cad(tmp_path / "data"))
         truth = {
             (photo.name, found.object_id): found.truth.cam_from_model
@@ -161,7 +161,7 @@ class TestMethods:
         assert error["rigid+mask"] < error["rigid"]
         assert all(row["status"] == "ok" for row in found.results.to_pylist())
 
-    def test_what_an_object_lacks_is_left_out(self, tmp_path: Path) -> None:
+    def test_objects_without_the_evidence_are_left_out(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data", photos=2)
         (root / "mask" / "1.png").unlink()
         methods = ("rigid", "rigid+mask", "rigid+gravity")

@@ -215,11 +215,11 @@ def check_names(functions: Iterable[Function], taken: Container[str], where: str
 def _answer_of(given: MethodInput, *, function: Function) -> Alignment | Result:
     """Call a user's method and check what it returns."""
     loaded = _load(function, "methods")
-    told = {"sigma": given.sigma} if _takes_sigma(loaded) else {}
+    options = {"sigma": given.sigma} if _takes_sigma(loaded) else {}
     # Copies, as the function may modify its arguments.
     arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
     try:
-        return _check_answer(loaded(*arguments, **told))
+        return _check_answer(loaded(*arguments, **options))
     except SystemExit as error:
         raise CadalignError(f"it called sys.exit ({error})") from None
 

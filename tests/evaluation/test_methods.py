@@ -98,7 +98,7 @@ def test_a_local_function_runs_only_without_workers() -> None:
     assert (simulate([local]).status == "ok").all()
     with pytest.raises(InputError, match="workers: a function cannot be sent to worker") as caught:
         simulate([local], workers=1)
-    assert "define it in a module that they can import, or name it module:f" in str(caught.value)
+    assert "define it in an importable module, give module:f" in str(caught.value)
 
 
 _SCRIPT = """
@@ -124,7 +124,7 @@ def test_a_script_needs_no_guard_and_its_functions_are_refused(tmp_path: Path) -
     )
     good, refused = done.stdout.splitlines()
     assert good == "True"
-    assert "(it is defined in a script or a notebook); define it in a module that" in refused
+    assert "(it is defined in a script or a notebook); define it in an importable" in refused
 
 
 def test_a_run_names_its_functions(tmp_path: Path) -> None:

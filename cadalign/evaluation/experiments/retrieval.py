@@ -103,7 +103,7 @@ COLUMNS: Columns = (
 )
 
 TOP = 50
-"""Largest rank that is told apart."""
+"""Number of matches per query; ranks beyond it are missing."""
 _SHAPE_SIGMA = 0.02  # of a similar model's keypoints, relative to their extent
 _LEAST_SIGMA = 0.5  # [px]; without noise, similar models would have no likelihood
 

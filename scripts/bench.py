@@ -1,11 +1,11 @@
-"""Measure accuracy and speed by sections: the figures of docs/results.md.
+"""Measure accuracy and speed by sections: the numbers of docs/results.md.
 
-    python scripts/bench.py                            # what `make bench` measures
+    python scripts/bench.py                            # the sections of `make bench`
     python scripts/bench.py cold speed                 # two sections
     python scripts/bench.py retrieval --sizes 1000 10000 --count 10
 
-Each section prints its tables. Times have a ratio to other work that is measured in turns with
-them, which depends little on the machine: less is better.
+Each section prints its tables. A column `ratio` compares a time with a reference that is measured
+alternately; it depends little on the machine, and less is better.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ ON_REQUEST = {"evidence", "photo", "cars"}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the sections."""
+    """Run the chosen sections."""
     options = tyro.cli(BenchmarkData, description=__doc__, args=arguments)
     unknown = ", ".join(name for name in options.sections if name not in SECTIONS)
     if unknown:
-        sys.exit(f"no section {unknown}; known are {', '.join(SECTIONS)}")
+        sys.exit(f"unknown section {unknown}; known are {', '.join(SECTIONS)}")
     for name in options.sections or [each for each in SECTIONS if each not in ON_REQUEST]:
         try:
             for title, rows in SECTIONS[name](options):
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
         except DataError as error:
             if name in options.sections:
                 sys.exit(f"{name}: {error}")
-            print(f"the rest of {name} is left out: {error}")
+            print(f"the rest of {name} is skipped: {error}")
 
 
 if __name__ == "__main__":

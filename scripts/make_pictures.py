@@ -1,7 +1,7 @@
-"""Make the documentation's pictures of alignments.
+"""Make the pictures of the documentation.
 
 python scripts/make_pictures.py overview
-python scripts/make_pictures.py chairs --files chairs     # with the files of the worked example
+python scripts/make_pictures.py chairs --files chairs     # also keeps the example's files
 python scripts/make_pictures.py concepts
 """
 
@@ -41,7 +41,7 @@ PHOTO_GROUND = (206, 208, 212)
 
 
 def overview() -> None:
-    """Overlays of four sample models, side by side: the README's picture."""
+    """Make the README's picture: overlays of four sample models."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = KeypointNet(write_sample_dataset(Path(folder) / "sample"))
         pictures = [_overlay(dataset, *model) for model in MODELS]
@@ -67,15 +67,15 @@ def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
 
 
 def chairs(*, files: Path | None = None) -> None:
-    """Align one sample chair to a photo of another: the README's worked example.
+    """Make the README's worked example: align a sample chair to a rendered photo of another one.
 
-    The photo is a rendering of the one chair; keypoints are joined by their semantic ids.
+    Keypoints correspond by their semantic ids.
 
     Parameters
     ----------
     files : Path, optional
-        Folder for the photo, the observation, the model's keypoints and the picture, which is
-        docs/other_chair.png by default.
+        Folder for the photo, the observation, the model's keypoints and the picture. By default
+        only docs/other_chair.png is kept.
     """
     with tempfile.TemporaryDirectory() as folder:
         root = files or Path(folder)
@@ -102,7 +102,7 @@ def chairs(*, files: Path | None = None) -> None:
 
 
 def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
-    """Render the photo; its visible keypoints, with the other model's points of the same ids."""
+    """Render a photo and return its visible keypoints with the other model's points."""
     scene = Scene(seen.load_mesh())
     pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
     write_image(photo, still(scene))
@@ -118,19 +118,19 @@ def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observa
         ids=shared,
         image=photo,
         model=model.mesh_path,
-        fit_options={"sigma": None},  # two chairs agree less well than pixels do
+        fit_options={"sigma": None},  # the chairs differ by more than the pixels' noise
     )
 
 
 def still(scene: Scene) -> ByteImage:
-    """A picture of a chair, (h, w, 3) uint8."""
+    """Render a chair, (h, w, 3) uint8."""
     pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
     frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
     return frame.composite(PHOTO_GROUND)
 
 
 def concepts() -> None:
-    """Pictures of the pages on concepts, one each."""
+    """Make one picture for each page on concepts."""
     with tempfile.TemporaryDirectory() as folder:
         root = write_sample_dataset(Path(folder) / "sample", per_category=60)
         dataset = KeypointNet(root)
@@ -146,7 +146,7 @@ def concepts() -> None:
 
 
 def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
-    """True and predicted box from the front, where they agree, and from the side."""
+    """True and estimated box from the front, where they agree, and from the side."""
     scene, xyz = Scene(model.load_mesh()), model.keypoints.xyz
     front = xyz[np.argsort(xyz[:, 2])[:4]]  # in one plane
     poses = [pose_in_view(scene, CHAIR_CAMERA, Angles(azimuth=a, elevation=4.0)) for a in (0, 70)]
@@ -175,7 +175,7 @@ def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
 
 
 def _view_of(model: AnnotatedModel, *, noise_px: float) -> tuple[ByteImage, View]:
-    """A photo of a chair, and its visible keypoints."""
+    """A rendered photo of a chair, and its visible keypoints."""
     scene = Scene(model.load_mesh())
     pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
     visible = visible_keypoints(scene, model.keypoints.xyz, CHAIR_CAMERA, pose)
@@ -187,7 +187,7 @@ def _view_of(model: AnnotatedModel, *, noise_px: float) -> tuple[ByteImage, View
 
 
 def _regions(dataset: KeypointNet) -> list[ByteImage]:
-    """95 % regions of the keypoints of a learned shape: by all that are visible, and by four."""
+    """95 % regions of a learned shape's keypoints, from all visible keypoints and from four."""
     shape = ShapeModel.from_dataset(dataset, "chair", split="train")
     photo, view = _view_of(dataset.subset(split="test")["chair"][0], noise_px=2.0)
     few = View(CHAIR_CAMERA, view.pixels[:4], ids=view.keypoint_ids[:4], sigma=2.0)
@@ -195,7 +195,7 @@ def _regions(dataset: KeypointNet) -> list[ByteImage]:
 
 
 def _equal_poses(model: AnnotatedModel) -> list[ByteImage]:
-    """A bottle in three turns about its axis, with the axes of its box."""
+    """A bottle at three rotations about its axis, with its box."""
     scene = Scene(model.load_mesh())
     pictures = []
     for degrees in (0, 40, 90):
@@ -209,7 +209,7 @@ def _equal_poses(model: AnnotatedModel) -> list[ByteImage]:
 
 
 def _modes(dataset: KeypointNet) -> list[ByteImage]:
-    """A chair warped by 3 standard deviations of the second mode; the first is the size."""
+    """A chair warped by -3, 0 and 3 standard deviations of the second mode (the first is size)."""
     shape = ShapeModel.from_dataset(dataset, "chair", split="train")
     component, model = shape.components[0], dataset["chair", "sample_chair_000"]
     rows = [shape.ids.index(int(label)) for label in model.keypoints.ids]
@@ -221,7 +221,7 @@ def _modes(dataset: KeypointNet) -> list[ByteImage]:
 
 
 def _matches(dataset: KeypointNet) -> list[ByteImage]:
-    """The photo of a chair, and the three best matches of a library over it."""
+    """A photo of a chair, and overlays of the three best matches."""
     photo, view = _view_of(dataset["chair", "sample_chair_006"], noise_px=1.0)
     library = Library.from_models(dataset["chair"])
     matches = library.retrieve(view.pixels, view.keypoint_ids, CHAIR_CAMERA, top=3)
@@ -229,7 +229,7 @@ def _matches(dataset: KeypointNet) -> list[ByteImage]:
 
 
 def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:
-    """Write pictures of one height side by side, shrunk to a width [px] in all."""
+    """Write pictures of equal height side by side, scaled to a total width [px]."""
     row = np.hstack(pictures)
     height = round(row.shape[0] * width / row.shape[1])
     write_image(path, cv2.resize(row, (width, height), interpolation=cv2.INTER_AREA))

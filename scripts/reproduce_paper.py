@@ -1,6 +1,6 @@
-"""Make every table and figure of the AEPnP paper anew, each beside the paper's own numbers.
+"""Reproduce the tables and figures of the AEPnP paper, beside the paper's own numbers.
 
-Killed, it goes on where it was when it is started again with the same arguments.
+An interrupted run continues when the same command is started again.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from cadalign.io.files import made_folder, write_text
 
 _DATASETS = {
     "sample": "The sample dataset (parametric models, visibility by rays)",
-    "keypointnet": "The dataset given (visibility by rays where there is a mesh, else by the hull)",
+    "keypointnet": "The given dataset (visibility by rays, or by the hull without a mesh)",
 }
 _HEAD = ("category", "method", "keypoints", "R [deg]", "t", "s1 (y) [%]", "s2 (z) [%]", "R / limit")
 
 # The AEPnP paper's Table 1 as printed: 1 px noise, medians [degrees, model units], mean keypoints.
-# It prints the scale errors under "%"; by the numbers in its own source they are fractions.
+# Its scale errors are headed "%", but are fractions according to the numbers in its source.
 PAPER_TABLE = {
     "chair": (0.998, 0.004, 0.008, 0.012, 7),
     "bottle": (7.004, 0.100, 0.089, 0.107, 7),
@@ -46,8 +46,8 @@ PAPER_TABLE = {
 """Rotation error, translation error, errors of s_y and s_z, number of keypoints."""
 STATED = "AEPnP, stated in the paper"
 PERCENT_NOTE = (
-    'The paper\'s columns s1 and s2 are headed "%", but by the numbers in its own source they are '
-    "fractions: 0.008 means 0.8 %. They are shown here as such, times 100."
+    'The paper\'s columns s1 and s2 are headed "%", but are fractions according to the numbers in '
+    "its source: 0.008 means 0.8 %. Here they are multiplied by 100."
 )
 
 
@@ -56,24 +56,24 @@ class PaperPlan(RunOptions):
     """Runs for the paper's tables and figures."""
 
     out: Path = Path("paper")
-    """Folder to write to."""
+    """Folder for all results."""
     root: Path | None = None
-    """Dataset in KeypointNet's layout, besides the sample dataset."""
+    """Folder in KeypointNet's layout, in addition to the sample dataset."""
     quick: bool = False
-    """Few problems: about two minutes."""
+    """Use few problems; takes about two minutes."""
     seed: int = ExperimentOptions.seed
-    """Seed of everything random."""
+    """Seed of the random number generators."""
 
 
 def reproduce_paper(plan: PaperPlan) -> Path:
-    """Run everything, or what is left of it; returns ``report.md``, beside runs and tables."""
+    """Run or continue everything; returns the path of ``report.md``."""
     made_folder(plan.out)
-    quick = " This is the quick pass, with few problems: numbers are rough." if plan.quick else ""
+    quick = " Numbers are rough, as --quick uses few problems." if plan.quick else ""
     sections = [
         "# The AEPnP paper's tables and figures\n",
-        f"Seed {plan.seed}.{quick} Every run's own folder, with all rows, its configuration and "
-        "more figures, lies beside this file. Lines are medians; the dashed line "
-        "is the Cramer-Rao bound, the least error that any unbiased method can have.\n",
+        f"Seed {plan.seed}.{quick} The folders beside this file hold all rows, configurations and "
+        "further figures. Lines are medians; the dashed line is the Cramer-Rao bound, the smallest "
+        "error of an unbiased method.\n",
         _table_section(plan),
         *(_sweep_section(plan, name) for name in SWEEPS),
     ]
@@ -109,7 +109,7 @@ def _sweep_section(plan: PaperPlan, name: str) -> str:
 
 
 def _table_section(plan: PaperPlan) -> str:
-    """Evaluate on the sample dataset, and on the dataset that is given; write Table 1."""
+    """Evaluate on the sample dataset, and on the given one; write Table 1."""
     sample = write_sample_dataset(plan.out / "sample_dataset", per_category=12)
     roots = {"sample": (sample, 2 if plan.quick else 40)}
     if plan.root is not None:
@@ -130,7 +130,7 @@ def _table_section(plan: PaperPlan) -> str:
 
 
 def _table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
-    """The rows of Table 1: our medians, and the paper's beneath where it states them."""
+    """The rows of Table 1: our medians, followed by the paper's."""
     rows = []
     categories = dict.fromkeys(summary.group for summary in summaries)
     for category in sorted(categories, key=lambda name: name != ALL):
@@ -140,7 +140,7 @@ def _table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
             texts = [column.text(summary[column.key]) for column in TABLE[:5]]
             rows.append([category, name, *texts, ratio])
         if category in PAPER_TABLE:
-            # With the digits that the paper prints.
+            # The digits are the paper's.
             rotation, translation, scale_y, scale_z, keypoints = PAPER_TABLE[category]
             errors = f"{rotation:.3f}", f"{translation:.3f}"
             scales = f"{100 * scale_y:.1f}", f"{100 * scale_z:.1f}"
@@ -149,7 +149,7 @@ def _table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
 
 
 def main() -> int:
-    """Run it; returns the exit code."""
+    """Run the script; returns the exit code."""
     plan = tyro.cli(PaperPlan, description=__doc__)
     try:
         report = reproduce_paper(plan)

@@ -1,4 +1,4 @@
-"""The scripts start, and the worked example's files are what its page says."""
+"""Scripts start, and the worked example agrees with its page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks import section
-from benchmarks.evidence import SeenObject, aligned, draw_object, moved
+from benchmarks.evidence import SeenObject, align_with, draw_object, move
 from benchmarks.section import BenchmarkData, Row, Tables
 
 from cadalign.cli import main
@@ -32,7 +32,7 @@ SCRIPTS = sorted(
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Run a script in this process; gives its exit code."""
+    """Run a script in this process and return its exit code."""
 
     def run_script(script: Path, *arguments: str) -> int:
         monkeypatch.setattr(sys, "argv", [str(script), *arguments])
@@ -78,12 +78,12 @@ def toy(given: BenchmarkData) -> Tables:
         raise DegenerateError(place)
 
     methods = {"fit": lambda place: {"error": len(place) / 4, "good": False}, "none": refused}
-    yield "sizes", section.summaries(section.measured(cases, methods), "method", "place")
+    yield "sizes", section.summaries(section.measure(cases, methods), "method", "place")
     given.folder("keypointnet")
 
 
 class TestSections:
-    """`bench.py` with a section of three cases and two methods, the second of which refuses all."""
+    """`bench.py` with a section of three cases and two methods; the second one always fails."""
 
     @pytest.fixture
     def bench(self, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
@@ -98,13 +98,13 @@ class TestSections:
         bench()
         printed = capsys.readouterr().out
         assert "| fit | near | 1 | 1 (1) | 0 |\n| fit | far | 2 | 0.75 (0.75) | 0 |" in printed
-        assert "the rest of toy is left out: give --data, or CADALIGN_DATA" in printed
+        assert "the rest of toy is skipped: give --data, or set CADALIGN_DATA" in printed
 
     @pytest.mark.parametrize(
         ("name", "message"),
         [
-            ("toy", "toy: give --data, or CADALIGN_DATA"),
-            ("nothing", "no section nothing; known are toy"),
+            ("toy", "toy: give --data, or set CADALIGN_DATA"),
+            ("nothing", "unknown section nothing; known are toy"),
         ],
     )
     def test_a_named_section_must_run(
@@ -126,7 +126,7 @@ class TestEvidenceWithoutNoise:
         points = np.asarray(car.model.points_3d)
         for view in car.views:
             motion = np.asarray(view.cam_from_rig)
-            seen = moved(car.instance.gt, motion).apply(points[np.asarray(view.ids)])
+            seen = move(car.instance.gt, motion).apply(points[np.asarray(view.ids)])
             np.testing.assert_allclose(KEYPOINT_CAMERA.project(seen), view.points_2d, atol=1e-8)
         rows, columns = np.nonzero(car.mask("exact"))
         pixels = np.asarray(car.views[0].points_2d)
@@ -138,9 +138,9 @@ class TestEvidenceWithoutNoise:
         "kind",
         ["keypoints", "gravity", "length", "depth", "views-2", "views-2-free"],
     )
-    def test_bound_is_that_of_the_estimate(self, car: SeenObject, kind: str) -> None:
-        """The estimate is the truth, where the inverse of the information is the bound."""
-        result = aligned(kind, car)
+    def test_the_estimate_states_the_bound(self, car: SeenObject, kind: str) -> None:
+        """Without noise the estimate is the truth, and the inverse information is the bound."""
+        result = align_with(kind, car)
         assert rotation_error(est=result.alignment, gt=car.instance.gt) < 1e-3
         stated, bound = (
             np.sqrt(each.diagonal()) for each in (result.covariance, result.fisher_covariance)

@@ -1,4 +1,4 @@
-"""Whole experiments in one call: as on the command line, with tables as DataFrames."""
+"""Run an experiment in one call and return its result table as a DataFrame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError, unknown
 from cadalign.evaluation.methods import check_names
-from cadalign.evaluation.options import ExperimentOptions, absolute_paths, tuples
+from cadalign.evaluation.options import ExperimentOptions, absolute_paths, as_tuples
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.engine import OnProgress, Workers, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
@@ -32,44 +32,45 @@ def evaluate(
     out: str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> pd.DataFrame:
-    """Evaluate methods on a dataset.
+    """Run an experiment: evaluate methods on a dataset.
 
     Parameters
     ----------
     root : str or path-like, optional
-        The dataset, for experiments that have one: a folder in KeypointNet's layout
-        (``keypointnet``, ``retrieval``, ``unseen``), a data set of photos
-        (``photos``), or a COLMAP or blind-PnP model (``correspondences``).
+        The dataset: a folder in KeypointNet's layout (``keypointnet``, ``retrieval``,
+        ``unseen``, ``demo``), a data set of photos (``photos``), or a COLMAP model or a
+        blind-PnP data set (``correspondences``). ``simulate`` has none.
     experiment : {"keypointnet", "correspondences", "retrieval", "unseen", "photos",
         "simulate", "demo"}
         Name of the experiment.
     workers : int, optional
-        Processes; -1 for one for each core (the default), 0 for none.
+        Number of worker processes; -1 for one per core (the default), 0 for this process alone.
     dask : str, optional
-        Address of a Dask scheduler, whose workers are used instead.
+        Address of a Dask scheduler; its workers replace the processes.
     out : str or path-like, optional
-        A run's folder, to keep; a run that was killed there goes on.
+        Folder for the run's files, temporary by default. A run that was interrupted there
+        continues.
     **options
         Options of the experiment, the same as on the command line: ``noise_px=2.0`` is
         ``--noise-px 2``. The options of ``keypointnet`` are the fields of
         `cadalign.evaluation.experiments.keypointnet.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
-        ``visibility``, ``render``, ``metrics``, ``seed``. Among ``methods`` and
-        ``metrics`` may be functions of one's own, as callables or as texts ``module:function``.
-        Worker processes import them; others need ``workers=0``.
+        ``visibility``, ``render``, ``metrics``, ``seed``. ``methods`` and ``metrics`` also take
+        your own functions, as callables or as ``module:function``. Worker processes import
+        them; a function that cannot be imported needs ``workers=0``.
 
     Returns
     -------
     pandas.DataFrame
-        A row for every task and method, and the seconds that it took. Failed ones have the status
-        ``failed`` and a reason.
+        One row per task and method: errors, ``seconds``, and ``status``. A failure has the status
+        ``failed`` and a ``reason``.
 
     Raises
     ------
     InputError
-        If an option is invalid, or the experiment, a category or a split unknown.
+        If an option is invalid, or an experiment, a category or a split is unknown.
     DataError
-        If there is no dataset, or the folder holds another run.
+        If the dataset is missing, or the folder holds another run.
 
     Examples
     --------
@@ -85,8 +86,8 @@ def evaluate(
         if isinstance(options[name], str) or callable(options[name]):
             options[name] = (options[name],)
     kind = spec_named(experiment).options
-    _check_given(kind, experiment, source, options)
-    chosen = kind(*source, **tuples(options))
+    _check_options(kind, experiment, source, options)
+    chosen = kind(*source, **as_tuples(options))
     with ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
@@ -97,10 +98,10 @@ def evaluate(
         return frame.assign(seconds=done.cells["seconds"])
 
 
-def _check_given(
+def _check_options(
     kind: type[ExperimentOptions], experiment: str, source: Sequence[object], given: Collection[str]
 ) -> None:
-    """Check that all options of an experiment that it needs are given, and no others."""
+    """Raise InputError for an unknown option, or a missing one without a default."""
     own = {each.name: each for each in fields(kind) if each.init}
     for name in given:
         if name not in own:
@@ -110,8 +111,7 @@ def _check_given(
         raise InputError(f"{experiment} has no dataset", where="root", fix="leave it out")
     for each in placed[len(source) :]:
         if each.name not in given and each.default is MISSING:
-            fix = f"{experiment} cannot do without"
-            raise InputError("is not given", where=each.name, fix=fix)
+            raise InputError("is missing", where=each.name, fix=f"{experiment} needs it")
 
 
 def run(
@@ -122,9 +122,9 @@ def run(
     dask: str | None,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
-    """Do the run that the options describe in a folder, or what is left of it.
+    """Run an experiment in a folder; an interrupted run continues.
 
-    ``workers`` and ``dask`` are those of `evaluate`; ``on_progress`` is told of every chunk.
+    ``workers`` and ``dask`` are options of `evaluate`. ``on_progress`` is called after every chunk.
     """
     plan, pool = prepared(options, folder, workers=workers, dask=dask)
     execute(plan, folder, workers=pool, on_progress=on_progress)
@@ -133,7 +133,7 @@ def run(
 def prepared(
     options: ExperimentOptions, folder: RunFolder, *, workers: int | None, dask: str | None
 ) -> tuple[Plan[Any], Workers]:
-    """The plan and the workers of `run`."""
+    """Return the plan and the workers of `run`."""
     if dask is not None:
         options, folder = absolute_paths(options), absolute_paths(folder)
     count = options.default_workers if workers is None else workers

@@ -1,12 +1,12 @@
-"""Methods and metrics by name: those of `cadalign.fit`, and functions of users.
+"""Methods and metrics by name: methods of `cadalign.fit`, and functions of users.
 
-A function of ``(points_3d, points_2d, camera)`` that returns an alignment or a result is a method,
-one of keywords such as ``est`` and ``gt`` that returns a number a metric::
+A method is a function of ``(points_3d, points_2d, camera)`` that returns an alignment or a result.
+A metric is a function of keywords such as ``est`` and ``gt`` that returns a number::
 
     cadalign.evaluate("keypointnet", methods=[my_function, "my_module:solve", "optimal"])
 
-On the command line, ``--methods my_module:solve optimal`` does the same. Worker processes import
-the module; a function that they cannot import runs without workers.
+On the command line, use ``--methods my_module:solve optimal``. Worker processes import the module;
+a function that they cannot import needs ``workers=0``.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ if TYPE_CHECKING:
     from cadalign.evaluation.simulation import SimulatedProblem
 
 LIMIT = "limit"
-"""The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.errors`."""
+"""Name of the Cramer-Rao bound among methods; see `cadalign.evaluation.metrics.errors`."""
 SHAPE = "shape"
-"""The alignment of a category's learned shape, in runs that have one."""
+"""Name of the alignment of a category's learned shape."""
 _ARGUMENTS = ("est", "gt", "result", "points_3d", "points_2d", "camera", "sigma", "bounds")
 _FIX = "give module:function"
 
 
 @dataclass(frozen=True, eq=False)
 class MethodInput:
-    """An instance as general methods are given it."""
+    """The input of general methods."""
 
     points_3d: FloatArray  # (n, 3), keypoints on the model [model units]
     points_2d: FloatArray  # (n, 2), their observations [px]
     camera: Camera
-    sigma: float  # standard deviation of the observations that methods are given [px]
-    bounds: FloatArray | None = None  # (2, 3), least and greatest coordinates of the model
-    ransac: RansacOptions | None = None  # options of searches for inliers
+    sigma: float  # standard deviation of the observations [px] as methods get it
+    bounds: FloatArray | None = None  # (2, 3), lowest and highest coordinates of the model
+    ransac: RansacOptions | None = None  # for RANSAC methods
     gt: Alignment | None = None
-    """The truth, for metrics and for the Cramer-Rao bound; no method is given it."""
-    inliers: BoolArray | None = None  # (n,), the true inliers, for the bound
+    """The truth, for metrics and the Cramer-Rao bound; hidden from methods."""
+    inliers: BoolArray | None = None  # (n,), true inliers, for the Cramer-Rao bound
 
     @classmethod
     def of_problem(
         cls, problem: SimulatedProblem, sigma: float, *, ransac: RansacOptions | None = None
     ) -> MethodInput:
-        """A simulated problem with the noise [px] that methods are told."""
+        """The input of a simulated problem; ``sigma`` [px] is the noise as methods get it."""
         inliers = None if problem.outliers is None else ~problem.outliers
         seen = problem.points_3d, problem.points_2d, problem.camera
         return cls(*seen, sigma, ransac=ransac, gt=problem.alignment, inliers=inliers)
@@ -74,34 +74,34 @@ def pose_of(estimate: Any) -> Alignment:
 
 @dataclass(frozen=True)
 class Method:
-    """A method by name."""
+    """A method: its name and how it solves instances."""
 
     name: str
     solve: Callable[[Any], Any]
-    """Makes an estimate; raises where it has none. A general method takes a `MethodInput` and
-    returns an alignment or a result of `cadalign.fit`; another one takes an
-    instance of its benchmark, and returns what that measures."""
+    """Returns an estimate, or raises. A general method takes a `MethodInput` and returns an
+    alignment or a result of `cadalign.fit`; any other method takes an instance of its benchmark and
+    returns an estimate that the benchmark measures."""
     solve_many: Callable[[Sequence[Any]], list[Any]] | None = None
-    """Makes estimates of a sequence, with an error in the place of one that there is not."""
+    """Returns an estimate or an error for each input of a sequence."""
     is_general: bool = False
     has_statistics: bool = False
-    """``solve`` states uncertainties and alternatives, ``solve_many`` does not."""
+    """True if ``solve`` states uncertainties and alternatives, which ``solve_many`` does not."""
 
 
-# Names for a method together with options of `cadalign.fit`.
+# Names of methods with further options of `cadalign.fit`.
 _VARIANTS: dict[str, dict[str, Any]] = {
     "optimal-huber": {"method": "optimal", "loss": "huber"},
     "optimal-cauchy": {"method": "optimal", "loss": "cauchy"},
 }
-# Robust ones, the minimal solver and whether the optimum over all inliers is returned. With the
-# linear solver, on 6 points, these are the AEPnP paper's RANSAC-AEPnP, and the same refined.
+# RANSAC methods: the minimal solver, and whether the optimum over all inliers is returned. The last
+# two are the AEPnP paper's RANSAC-AEPnP (linear solver, 6 points), and the same refined.
 _RANSAC: dict[str, dict[str, Any]] = {
     "ransac-optimal": {"minimal": "ap4p", "refine": True},
     "ransac-ap4p": {"minimal": "ap4p", "refine": False},
     "ransac-aepnp": {"minimal": "aepnp", "refine": False},
     "ransac-aepnp-refined": {"minimal": "aepnp", "refine": True},
 }
-_INLIER_BOUND = 3.5  # [standard deviations], longer than 99.8 % of Gaussian errors in the plane
+_INLIER_BOUND = 3.5  # [standard deviations], exceeds 99.8 % of Gaussian errors in the plane
 
 
 @cache
@@ -122,10 +122,10 @@ def fit_methods() -> dict[str, Method]:
 
 
 def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None) -> dict[str, Any]:
-    """The options of `cadalign.fit` and `cadalign.fit_batch` that make it a method.
+    """The options of `cadalign.fit` and `cadalign.fit_batch` for a method.
 
-    Robust methods take what lies within 3.5 ``sigma`` [px] for an inlier, or go by ``ransac``, but
-    for the minimal solver and the refinement, which are the method's own.
+    RANSAC methods use ``ransac``, by default an inlier threshold of 3.5 ``sigma`` [px]; the method
+    sets the minimal solver and the refinement.
     """
     if name in _RANSAC:
         common = ransac or RansacOptions(max_reproj_error=_INLIER_BOUND * sigma)
@@ -141,7 +141,7 @@ def _fit(given: MethodInput, *, name: str) -> Result:
 
 
 def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | CadalignError]:
-    """The alignments of many instances, in batches of one standard deviation and camera."""
+    """Fit many instances, in batches with one standard deviation and camera."""
     from cadalign.estimation.fit import fit_batch
 
     found: list[Alignment | CadalignError] = []
@@ -153,7 +153,7 @@ def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | C
             camera,
             **fit_options(name, sigma=sigma, ransac=None),
         )
-        errors = batch.errors  # made anew at every look
+        errors = batch.errors  # a property that is computed on each access
         found += [errors.get(b) or batch.alignment(b) for b in range(len(batch))]
     return found
 
@@ -171,10 +171,10 @@ def _bound(given: MethodInput) -> Alignment:
 
 
 @lru_cache(maxsize=64)
-def imported(text: str, *, where: str) -> Callable[..., Any]:
-    """Import ``module:function``; the working directory is searched, too.
+def import_function(text: str, *, where: str) -> Callable[..., Any]:
+    """Import ``module:function``, also from the working directory.
 
-    Raises InputError if the module cannot be imported, or has no such function.
+    Raises InputError if the module cannot be imported, or lacks the function.
     """
     module_name, _, name = text.partition(":")
     if str(Path.cwd()) not in sys.path:
@@ -194,38 +194,38 @@ def imported(text: str, *, where: str) -> Callable[..., Any]:
     return function
 
 
-def _loaded(function: Function, where: str) -> Callable[..., Any]:
-    return imported(function, where=where) if isinstance(function, str) else function
+def _load(function: Function, where: str) -> Callable[..., Any]:
+    return import_function(function, where=where) if isinstance(function, str) else function
 
 
 def check_names(functions: Iterable[Function], taken: Container[str], where: str) -> None:
-    """Raise InputError for functions without names for tables, or with names that are taken."""
+    """Raise InputError for functions whose names are no identifiers, or are taken."""
     known: set[str] = set()
     for function in functions:
         name = name_of(function)
         if not name.isidentifier():
-            what = f"a function that is called {name} has no name for tables"
-            raise InputError(what, where=where, fix="define it by def")
+            what = f"a function named {name} cannot head a column of tables"
+            raise InputError(what, where=where, fix="define it with def")
         if name in known or name in taken:
-            what = f"{quote(name)} is the name of more than one"
-            raise InputError(what, where=where, fix="give the function another name")
+            what = f"the name {quote(name)} is already in use"
+            raise InputError(what, where=where, fix="rename the function")
         known.add(name)
 
 
 def _answer_of(given: MethodInput, *, function: Function) -> Alignment | Result:
-    """The answer of a user's function to an instance, checked."""
-    loaded = _loaded(function, "methods")
-    told = {"sigma": given.sigma} if _takes_sigma(loaded) else {}
-    # Copies: what the function does to them must not reach other methods.
+    """Call a user's method and check what it returns."""
+    loaded = _load(function, "methods")
+    options = {"sigma": given.sigma} if _takes_sigma(loaded) else {}
+    # Copies, as the function may modify its arguments.
     arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
     try:
-        return _checked_answer(loaded(*arguments, **told))
+        return _check_answer(loaded(*arguments, **options))
     except SystemExit as error:
-        raise CadalignError(f"it called for an exit ({error})") from None
+        raise CadalignError(f"it called sys.exit ({error})") from None
 
 
-def _checked_answer(answer: object) -> Alignment | Result:
-    """The answer of a function; raises InputError if it is no valid alignment and no result."""
+def _check_answer(answer: object) -> Alignment | Result:
+    """Return the alignment or result; raises InputError if it is neither, or invalid."""
     from cadalign.estimation.result import Result
 
     if not isinstance(answer, Alignment | Result):
@@ -241,29 +241,29 @@ def _checked_answer(answer: object) -> Alignment | Result:
 def _takes_sigma(function: Callable[..., Any]) -> bool:
     try:
         return "sigma" in inspect.signature(function).parameters
-    except (TypeError, ValueError):  # of some functions that are not written in Python
+    except (TypeError, ValueError):  # some functions of C extensions have no signature
         return False
 
 
 def choose_methods(
     chosen: Iterable[Any], own: Mapping[str, Method] | None = None
 ) -> tuple[Method, ...]:
-    """The methods of these names and functions, each once.
+    """The methods of names and functions, without repetition.
 
-    ``own`` are a benchmark's own methods by name, by default those of `cadalign.fit`. Raises
-    InputError if a method is unknown, or none is given.
+    ``own`` are a benchmark's methods by name, by default `fit_methods`. Raises InputError if a
+    method is unknown, or none is given.
     """
     table = fit_methods() if own is None else own
     return tuple(
         Method(name_of(each), partial(_answer_of, function=each), is_general=True)
         if is_function(each)
         else table[each]
-        for each in checked_methods(chosen, own)
+        for each in validate_methods(chosen, own)
     )
 
 
-def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -> tuple[Any, ...]:
-    """The names and functions, each once, if all are known; see `choose_methods`."""
+def validate_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -> tuple[Any, ...]:
+    """Check names and functions and drop repeated ones; see `choose_methods`."""
     known = fit_methods() if own is None else own
     found = tuple(dict.fromkeys(chosen))
     if not found:
@@ -274,7 +274,7 @@ def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -
             raise unknown("method", each, known, where="methods")
     check_names(filter(is_function, found), known, "methods")
     for function in filter(is_function, found):
-        _loaded(function, "methods")
+        _load(function, "methods")
     return found
 
 
@@ -283,7 +283,7 @@ def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -
 
 @dataclass(frozen=True)
 class FunctionMetric:
-    """A metric with the function that measures it, and the names of its parameters."""
+    """A metric with its function and the names of the function's parameters."""
 
     metric: Metric
     function: Function
@@ -291,10 +291,10 @@ class FunctionMetric:
 
     @classmethod
     def of(cls, function: Function) -> FunctionMetric:
-        """A function of keywords, any of those that it may have."""
+        """Make a metric; raises InputError for an unknown required parameter."""
         if not is_function(function):
             raise InputError(f"{quote(function)} is no function", where="metrics", fix=_FIX)
-        parameters = inspect.signature(_loaded(function, "metrics")).parameters.values()
+        parameters = inspect.signature(_load(function, "metrics")).parameters.values()
         variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
         required = [p.name for p in parameters if p.default is p.empty and p.kind not in variable]
         others = [name for name in required if name not in _ARGUMENTS]
@@ -304,10 +304,10 @@ class FunctionMetric:
         return cls(metric_named(name_of(function)), function, taken)
 
     def measure(self, estimate: Any, given: MethodInput) -> float | None:
-        """The number of an estimate; None for NaN, and where the truth is not known.
+        """Measure an estimate; None for NaN, or if the function needs an unknown truth.
 
-        ``estimate`` is an alignment, or has one as its ``alignment``. Raises InputError if the
-        function raises, or returns no number.
+        ``estimate`` is an alignment, or has an ``alignment``. Raises InputError if the function
+        raises, or does not return a number.
         """
         from cadalign.estimation.result import Result
 
@@ -318,7 +318,7 @@ class FunctionMetric:
         known = {**vars(given), "est": pose_of(estimate), "result": result}
         arguments = {name: known[name] for name in self.parameters}
         try:
-            value = _loaded(self.function, "metrics")(**arguments)
+            value = _load(self.function, "metrics")(**arguments)
         except Exception as error:
             raise InputError(f"{type(error).__name__}: {error}", where=where) from None
         if value is None or (is_real(value) and value != value):
@@ -333,9 +333,9 @@ class FunctionMetric:
 def choose_metrics(
     functions: Iterable[Function], columns: Columns = ()
 ) -> tuple[FunctionMetric, ...]:
-    """The functions as metrics, each once.
+    """Make metrics of functions, without repetition.
 
-    Raises InputError if one is none, or has the name of a column that is there already.
+    Raises InputError if one is not a function, or has the name of one of the columns.
     """
     found = tuple(FunctionMetric.of(each) for each in dict.fromkeys(functions))
     check_names((each.function for each in found), ("seconds", *dict(columns)), "metrics")

@@ -1,7 +1,7 @@
-"""Options that experiments share: each is at once API, command line and run configuration.
+"""Options that experiments share: keywords of the API, command line and run configuration.
 
-An experiment adds its own in its module. The command line takes a field's help from the text below
-it. These modules load quickly: `cadalign evaluate --help` imports them.
+An experiment adds its own options in its module. The docstring below a field is its help on the
+command line. These modules must load quickly: `cadalign evaluate --help` imports them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cadalign.errors import InputError, unknown
 
 T = TypeVar("T")
 Function = str | Callable[..., Any]
-"""A function, or the text ``module:function`` by which it is imported."""
+"""A function, or its import path ``module:function``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,92 +29,92 @@ class ExperimentOptions:
     """Options of every experiment."""
 
     experiment: ClassVar[str]
-    """Name of the experiment, as in the run's configuration."""
+    """Name of the experiment in the run's configuration."""
     command: ClassVar[str] = "evaluate"
-    """Command that runs it."""
+    """Command that runs the experiment."""
 
     seed: int = 0
-    """Seed of everything random."""
+    """Seed of the random number generator."""
 
     def __post_init__(self) -> None:
         self.check_least(seed=0)
 
     @property
     def run_name(self) -> str:
-        """Name of the run's folder, unless another is given."""
+        """Default name of the run's folder."""
         return self.experiment
 
     @property
     def default_workers(self) -> int:
-        """Number of worker processes, unless another is given; see `RunOptions`."""
+        """Default number of worker processes; see `RunOptions`."""
         return -1
 
     def as_config(self) -> dict[str, Any]:
-        """The options and the experiment's name in a run's configuration, paths made absolute.
+        """The run's configuration: options with absolute paths, and the experiment's name.
 
-        Options of several values have none there if they are empty.
+        Empty sequences are left out.
         """
         options = {name: each for name, each in plain_value(self).items() if each != []}
         return {**options, "experiment": self.experiment}
 
     def check_least(self, **bounds: float) -> None:
-        """Check that options, if they are given, are not less than their bounds."""
+        """Raise InputError for options below their bounds; None is allowed."""
         for name, least in bounds.items():
             value = getattr(self, name)
             if value is not None and not value >= least:
                 raise InputError(f"{value} is less than {least}", where=name)
 
     def check_known(self, **choices: tuple[str, ...]) -> None:
-        """Check that options are among those that are known."""
+        """Raise InputError for options that are not among their choices."""
         for name, known in choices.items():
             value = getattr(self, name)
             if value not in known:
                 raise unknown("value", value, known, where=name)
 
     def check_noise(self, *names: str) -> None:
-        """Check that options are standard deviations, which may be 0."""
+        """Raise InputError for standard deviations that are negative or not finite."""
         for name in names:
             value = getattr(self, name)
             if not 0 <= value < math.inf:
                 raise InputError(f"{value} is not a noise level", where=name)
 
     def replace_values(self, **values: Any) -> None:
-        """Set options of a new instance to their checked values."""
+        """Replace options of a new, still unshared instance."""
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
 
 def is_function(given: object) -> bool:
-    """True for a callable, and for a text ``module:function``."""
+    """True for a callable or an import path ``module:function``."""
     return callable(given) or (isinstance(given, str) and ":" in given)
 
 
 def name_of(function: Function) -> str:
-    """The name of a function in tables, that of its class for a callable object."""
+    """The name of a function in tables; for a callable object, its class's name."""
     if isinstance(function, str):
         return function.rpartition(":")[2].rpartition(".")[2]
-    function = _innermost(function)
+    function = _unwrap_partial(function)
     return str(getattr(function, "__name__", type(function).__name__))
 
 
 def text_of(function: Function) -> str:
-    """The function as ``module:function``, for a run's configuration."""
+    """The import path ``module:function`` of a function, for a run's configuration."""
     if isinstance(function, str):
         return function
-    function = _innermost(function)
+    function = _unwrap_partial(function)
     name = getattr(function, "__qualname__", type(function).__qualname__)
     return f"{function.__module__}:{name}"
 
 
-def _innermost(function: Any) -> Any:
-    """The function itself of one whose arguments are bound by functools.partial."""
+def _unwrap_partial(function: Any) -> Any:
+    """The function inside nested functools.partial objects."""
     while isinstance(function, partial):
         function = function.func
     return function
 
 
 def plain_value(value: Any) -> Any:
-    """The value as JSON has it, paths absolute and normalised, functions by their names."""
+    """Convert a value for JSON: absolute normalised paths, functions by their import paths."""
     if is_dataclass(value):
         return {each.name: plain_value(getattr(value, each.name)) for each in fields(value)}
     if callable(value):
@@ -130,34 +130,34 @@ def plain_value(value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class FunctionOptions(ExperimentOptions):
-    """Options of experiments that take functions of one's own, as methods and as metrics.
+    """Options of experiments that accept user functions as methods and metrics.
 
-    Each is a callable or a text ``module:function``; see `cadalign.evaluation.methods`.
+    Each is a callable or an import path ``module:function``; see `cadalign.evaluation.methods`.
     """
 
     metrics: tuple[str, ...] = ()
-    """Metrics of one's own, beside the experiment's: module:function."""
+    """Your own metrics, in addition to the experiment's: module:function."""
 
     def check_methods(self, own: tuple[str, ...] | None = None) -> None:
-        """Check methods, each once; ``own`` are the names of the experiment's, if it has any."""
-        from cadalign.evaluation.methods import checked_methods
+        """Check methods and drop repeated ones; ``own`` are the experiment's method names."""
+        from cadalign.evaluation.methods import validate_methods
 
-        self.replace_values(methods=checked_methods(getattr(self, "methods", ()), own))
+        self.replace_values(methods=validate_methods(getattr(self, "methods", ()), own))
 
 
 @dataclass(frozen=True)
 class ModelOptions(ExperimentOptions):
-    """Choice of the models of a dataset."""
+    """Selection of a dataset's models."""
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout."""
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
+    """Categories to use; all by default."""
     max_models: int | None = None
-    """Largest number of models of each category."""
+    """Maximum number of models per category; all by default."""
     shapenet: Path | None = None
-    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
+    """Folder of ShapeNetCore, if the meshes are not inside the dataset's folder."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -170,9 +170,9 @@ class ViewOptions(ModelOptions, FunctionOptions):
 
     _: KW_ONLY
     noise_px: float = 1.0
-    """Standard deviation of the keypoints' noise, in pixels."""
+    """Standard deviation of the keypoint noise [px]."""
     views_per_model: int = 1
-    """Number of views of each model, an instance each."""
+    """Number of views per model; each view is one instance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -181,24 +181,24 @@ class ViewOptions(ModelOptions, FunctionOptions):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the keypoints that methods are given [px]."""
+        """Standard deviation of the keypoints [px] as methods get it; 1 without noise."""
         return self.noise_px or 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Place and workers of a run; its results do not depend on them."""
+    """Folder and workers of a run; the results do not depend on them."""
 
     out: Path | None = None
-    """The run's folder; one in runs/, named after the experiment, by default."""
+    """Folder of the run; by default runs/ and the experiment's name."""
     workers: int | None = None
-    """Processes; -1 for one for each core (the default), 0 for none."""
+    """Number of worker processes; -1 for one per core (the default), 0 for this process alone."""
     dask: str | None = None
-    """Address of a Dask scheduler, whose workers are used instead."""
+    """Address of a Dask scheduler; its workers replace the processes."""
 
 
 def absolute_paths(value: T) -> T:
-    """The value with the paths in it absolute, for workers that were started elsewhere."""
+    """Make all paths in a value absolute, for workers with another working directory."""
     found: Any = value
     if isinstance(value, Path):
         found = value.absolute()
@@ -211,8 +211,8 @@ def absolute_paths(value: T) -> T:
     return cast(T, found)
 
 
-def tuples(options: dict[str, Any]) -> dict[str, Any]:
-    """Make the lists and other iterables among options tuples."""
+def as_tuples(options: dict[str, Any]) -> dict[str, Any]:
+    """Convert iterables among options to tuples, except for strings."""
     return {
         name: value if isinstance(value, str) or not hasattr(value, "__iter__") else tuple(value)
         for name, value in options.items()

@@ -1,4 +1,4 @@
-"""Figures of runs: lines of medians, and curves of shares, a colour for each method."""
+"""Figures of runs: medians against a quantity, and cumulative curves, one line per method."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
-from cadalign.evaluation.summary import Summary, known, where
+from cadalign.evaluation.summary import Summary, drop_nan, select_rows
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 
     from cadalign.evaluation.runs.tables import Cells, Run
 
-# Colours that colour-blind people tell apart, too: Okabe and Ito's (jfly.uni-koeln.de/color), then
-# dark ones of Paul Tol's "muted" (personal.sron.nl/~pault).
+# Colours for all kinds of colour vision: Okabe and Ito's (jfly.uni-koeln.de/color), then dark ones
+# of Paul Tol's "muted" (personal.sron.nl/~pault).
 COLORS = (
     *("#0072B2", "#E69F00", "#D55E00", "#CC79A7", "#009E73", "#56B4E9"),
     *("#332288", "#999933", "#882255", "#44AA99", "#AA4499", "#117733"),
 )
-"""Colours of lines, in their order."""
+"""Colours of lines, in order."""
 
 
 def color_of(method: str, place: int) -> str:
-    """The colour of a method by its place; that of the Cramer-Rao bound is black."""
+    """The colour of a method by its index; black for the Cramer-Rao bound."""
     return "black" if method == LIMIT else COLORS[place % len(COLORS)]
 
 
@@ -45,7 +45,7 @@ STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,  # TrueType, which publishers ask for
     "figure.dpi": 160,
 }
-"""Settings of matplotlib that all figures share."""
+"""Matplotlib settings of all figures."""
 
 _DIGITS = 6
 
@@ -54,8 +54,7 @@ _DIGITS = 6
 class Trace:
     """A line of a plot, in the units of its axes.
 
-    ``run`` is the place of the run among those that are compared. Values are None where there is
-    none.
+    ``run`` is the index of the run among the compared ones. Missing values are None.
     """
 
     run: int
@@ -67,13 +66,13 @@ class Trace:
     def of(
         cls, run: int, method: str, x: Sequence[float], y: Sequence[float], unit: Metric
     ) -> Trace:
-        """A line through values."""
+        """Make a line of values, which are converted to the metric's unit."""
         return cls(run, method, list(x), compact([unit.shown(value) for value in y]))
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot of lines, by default titled after its axes, with a note on its numbers."""
+    """A plot of lines, with a note on its numbers; the default title names its axes."""
 
     id: str
     x: Metric
@@ -83,7 +82,7 @@ class Plot:
     title: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """The plot for the page."""
+        """The plot for a page."""
         axes = {
             name: {key: axis.page()[key] for key in ("label", "unit", "log")}
             for name, axis in (("x", self.x), ("y", self.y))
@@ -101,7 +100,7 @@ class Plot:
 def plot_against(
     found: Sequence[Sequence[Summary]], x: Metric, y: Metric, *, place: str, **words: str
 ) -> Plot:
-    """Lines of a number against what runs vary, the cell ``place`` of their summaries, by method.
+    """Plot ``y`` against ``x``, which is the column ``place`` of summaries, by run and method.
 
     ``words`` are further fields of the plot.
     """
@@ -115,13 +114,13 @@ def plot_against(
 
 
 def compact(values: npt.ArrayLike | Sequence[float | None]) -> list[float | None]:
-    """Numbers with 6 digits; None for what is not finite."""
+    """Round numbers to 6 digits; None for numbers that are not finite."""
     numbers = np.asarray(values, dtype=float).tolist()
     return [float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None for value in numbers]
 
 
 def draw_plot(path: Path, plot: Plot) -> list[Path]:
-    """Draw a plot without a display, as PNG and PDF; ``path`` has no ending. Returns the files."""
+    """Draw a plot as PNG and PDF; ``path`` has no suffix. Returns the files."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -134,15 +133,15 @@ def draw_plot(path: Path, plot: Plot) -> list[Path]:
         _draw_lines(axes, plot)
         figure.legend(loc="outside lower center", ncols=2, handlelength=3.6)
         for file in files:
-            # Without its date a PDF is the same in every run.
+            # Without date or software, files are reproducible.
             metadata: Any = {"CreationDate": None} if file.suffix == ".pdf" else {"Software": None}
             write_whole(file, partial(figure.savefig, metadata=metadata))
-            figure.set_layout_engine("none")  # the first file's is the second's
+            figure.set_layout_engine("none")  # keep the layout of the first file
     return files
 
 
 def _draw_lines(axes: Axes, plot: Plot) -> None:
-    """Draw lines, which end where there is no value."""
+    """Draw lines, which break at missing values."""
     methods = list(dict.fromkeys(trace.method for trace in plot.traces))
     for trace in plot.traces:
         place, is_limit = methods.index(trace.method), trace.method == LIMIT
@@ -157,18 +156,17 @@ def _draw_lines(axes: Axes, plot: Plot) -> None:
         )
 
 
-def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
-    """Shares of the objects with at most an error, or at least an overlap, by method.
+def cumulative_plot(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
+    """Plot the share of objects with at most an error, or at least an overlap, by method.
 
-    ``metric`` is a column of the result tables, of which failures count as never within, while rows
-    that were left out, skipped or have no value do not count; ``places`` (k,) are the errors, in
-    the column's unit.
+    ``metric`` is a column of the result tables. Failures count as misses; rows that were left out,
+    skipped or have no value do not count. ``places`` (k,) are values of the metric on the x axis.
     """
     is_within = np.greater_equal if metric.better == HIGH else np.less_equal
     words = "at least this overlap" if metric.better == HIGH else "at most this error"
 
     def shares(rows: Cells) -> FloatArray:
-        errors = known(rows[metric.key][rows["status"] == OK])
+        errors = drop_nan(rows[metric.key][rows["status"] == OK])
         count = len(errors) + int((rows["status"] == FAILED).sum())
         return np.asarray(is_within(errors, places[:, None]).sum(axis=1) / max(count, 1))
 
@@ -176,7 +174,7 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
         Trace.of(index, method, places.tolist(), shares(rows).tolist(), metrics.COVERED)
         for index, run in enumerate(runs)
         for method in run.methods
-        for rows in [where(run.cells, run.cells["method"] == method)]
+        for rows in [select_rows(run.cells, run.cells["method"] == method)]
     ]
     return Plot(
         id=f"within_{metric.key}",
@@ -191,9 +189,9 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
 def cumulative_curves(
     runs: Sequence[Run], *, curves: Sequence[tuple[Metric, FloatArray]], of: str
 ) -> list[Plot]:
-    """Curves of the metrics that some run has, each at its places; see `cumulative`."""
+    """Cumulative plots of the metrics that some run has; see `cumulative_plot`."""
     return [
-        cumulative(runs, metric, places, title=f"{metric.label} {of}")
+        cumulative_plot(runs, metric, places, title=f"{metric.label} {of}")
         for metric, places in curves
-        if any(len(known(run.cells[metric.key])) for run in runs)
+        if any(len(drop_nan(run.cells[metric.key])) for run in runs)
     ]

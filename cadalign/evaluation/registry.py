@@ -1,8 +1,8 @@
-"""Specifications of experiments, all that command line and report know of them.
+"""Specifications of experiments: everything that the command line and reports need.
 
-An experiment is a module of `cadalign.evaluation.experiments`: options
+An experiment is a module of `cadalign.evaluation.experiments` with options
 (`cadalign.evaluation.options`), tasks and an experiment (`cadalign.evaluation.runs.work`), and a
-specification. Its runs, tables and page follow.
+specification.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import DataError, InputError, quote, unknown
-from cadalign.evaluation.metrics import CATEGORY, Metric, told
+from cadalign.evaluation.metrics import CATEGORY, Metric, has_values
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plot
 from cadalign.evaluation.runs.work import COLUMNS, SKIPPED, Columns, Plan
@@ -33,38 +33,38 @@ class Spec:
     """Specification of an experiment."""
 
     options: type[ExperimentOptions]
-    """A frozen dataclass derived from `ExperimentOptions`, which names the experiment; at once
-    keywords of the API, flags of the command line and configuration of the run."""
+    """A frozen dataclass derived from `ExperimentOptions`: keywords of the API, options of the
+    command line and configuration of the run."""
     plan: Callable[[Any, RunFolder], Plan[Any]]
-    """Makes the plan of a run from its options and its folder, in which it may put files."""
+    """Makes the plan of a run from its options and its folder, and may write files there."""
     columns: tuple[Metric, ...]
-    """Columns of the headline table; those are left out that no line has a value of."""
+    """Columns of the headline table; columns without any value are left out."""
     summarize: Callable[[Run], Summaries]
-    """Makes summaries of a run, finished or not; see `cadalign.evaluation.summary`."""
+    """Summarizes a run, finished or not; see `cadalign.evaluation.summary`."""
     results: Columns = COLUMNS
-    """Columns that the result table of a run must have to be summarized."""
+    """Required columns of a run's result table."""
     run: type[Run] | None = None
-    """The class of its runs; by default `cadalign.evaluation.runs.tables.Run`."""
+    """Class of the runs; `cadalign.evaluation.runs.tables.Run` by default."""
     console: tuple[Metric, ...] = ()
-    """Columns of the table for the console; by default those of the headline table."""
+    """Columns of the console's table; the columns of the headline table by default."""
     console_note: str = ""
     group: Callable[[Run], Metric] = lambda run: CATEGORY
-    """The column that a run's tasks are grouped by."""
+    """Returns the column that groups a run's tasks."""
     plots: Callable[[Sequence[Run]], list[Plot]] = lambda runs: []
-    """Makes the plots of a page of runs to be compared."""
+    """Makes the plots of a page that compares runs."""
     apart: str = SKIPPED
-    """Status of rows that are counted neither as failed nor as ok."""
+    """Status of rows that count neither as failed nor as ok."""
     metrics: tuple[Metric, ...] = ()
-    """Columns of the result table that a page's gallery shows, for experiments on instances."""
+    """Columns of the result table in a page's gallery, for experiments on instances."""
     kind: Callable[[Run], str] = lambda run: run.experiment
+    """Returns the name of a run's kind; runs of one kind can be compared."""
     joins: bool = False
-    """Runs of one kind, whose name this gives, can be compared."""
-    topic: str = ""  # what is evaluated, by default the experiment: ``topic on dataset``
-    subject: str = "tasks"  # what the tasks are, in the plural
+    topic: str = ""  # the kind by default; titles are "topic on dataset"
+    subject: str = "tasks"  # plural noun for the tasks
     describe: Callable[[Run], str] | None = None
-    """Says what the methods were run on, in place of the subject and the dataset."""
-    about: str = ""  # explains the pictures
-    note: str = ""  # explains the numbers of the headline table
+    """Describes the input of the methods, instead of subject and dataset."""
+    about: str = ""  # explanation of the pictures
+    note: str = ""  # explanation of the headline table
 
     @property
     def name(self) -> str:
@@ -72,19 +72,19 @@ class Spec:
         return self.options.experiment
 
     def open(self, path: Path, name: str | None = None) -> Run:
-        """Read a run of the experiment, ``name`` being its name beside others."""
+        """Read a run of the experiment; ``name`` distinguishes it from other runs."""
         from cadalign.evaluation.runs.tables import Run
 
         return (self.run or Run).open(path, name, columns=self.results)
 
     def title_of(self, runs: Sequence[Run]) -> str:
-        """A few words that name runs of one kind, such as ``alignment on keypointnet``."""
+        """A title for runs of one kind, such as ``alignment on keypointnet``."""
         topic = self.topic or self.kind(runs[0])
         datasets = dict.fromkeys(filter(None, (run.dataset for run in runs)))
         return f"{topic} on {', '.join(datasets)}" if datasets else topic
 
     def description_of(self, run: Run) -> str:
-        """Says what the methods were run on."""
+        """Describe the input of the methods."""
         if self.describe is not None:
             return self.describe(run)
         dataset = f" of {run.dataset}" if run.dataset else ""
@@ -108,13 +108,13 @@ class Spec:
     def shown_columns(
         self, lines: Summaries, runs: Sequence[Run], columns: Sequence[Metric] | None = None
     ) -> list[Metric]:
-        """The columns, by default the headline's, that some line has a value of.
+        """The columns (of the headline by default) with at least one value.
 
-        Those of further metrics are the last.
+        Metrics of users' functions come last.
         """
         further = {metric.key: metric for run in runs for metric in run.metrics}
         chosen = (*(self.columns if columns is None else columns), *further.values())
-        return [c for c in chosen if told(c, [line.number(c.key) for line in lines])]
+        return [c for c in chosen if has_values(c, [line.number(c.key) for line in lines])]
 
     def write(self, run: Run) -> Summaries:
         """Write ``summary.csv`` and ``figures`` of a finished run."""
@@ -126,7 +126,7 @@ class Spec:
         return summaries
 
 
-# In the order in which they are named to users, with module and name of their specifications.
+# In the order of help texts and messages.
 _EXPERIMENTS = {
     "keypointnet": "cadalign.evaluation.experiments.keypointnet:SPEC",
     "demo": "cadalign.evaluation.experiments.keypointnet:DEMO",
@@ -137,11 +137,11 @@ _EXPERIMENTS = {
     "photos": "cadalign.evaluation.experiments.photos:SPEC",
 }
 BATCHES: dict[str, str] = {}
-"""Specifications of runs over many observations, which `cadalign.report` shows likewise."""
+"""Specifications of batch runs over observations, which `cadalign.report` also shows."""
 
 
 def known_options() -> Iterator[type[ExperimentOptions]]:
-    """The options of all experiments."""
+    """The option classes of all experiments."""
     return (spec_named(name).options for name in _EXPERIMENTS)
 
 
@@ -161,7 +161,7 @@ def spec_of(run: Run) -> Spec:
 
 
 def spec_of_config(config: dict[str, Any], path: Path) -> Spec:
-    """The specification of the experiment that a run's configuration names; see `spec_of`."""
+    """The specification of the experiment in a run's configuration; raises DataError if unknown."""
     name = config.get("experiment")
     try:
         return spec_named(str(name))

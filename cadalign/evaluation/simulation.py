@@ -1,4 +1,4 @@
-"""Random problems with a known answer: the AEPnP paper's simulation, and boxes on the ground."""
+"""Random problems with a known solution, from the AEPnP paper's simulation."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ SIMULATION_CAMERA = Camera(width=640, height=480, fx=150.0, fy=150.0, cx=319.5, 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedProblem:
-    """Keypoints on a model (n, 3) and in an image (n, 2) [px], and the alignment that joins them.
+    """Keypoints of a model (n, 3), their pixels (n, 2), and the true alignment.
 
-    ``outliers`` (n,) are the observations that have nothing to do with their points; None where
-    there are none.
+    ``outliers`` (n,) masks the observations at random pixels; None without outliers.
     """
 
     points_3d: FloatArray
@@ -42,12 +41,12 @@ def simulate_problem(
 ) -> SimulatedProblem:
     """Draw one problem of the paper's simulation.
 
-    The object's points are uniform in the cube [-1, 1)^3 and the rotation is uniform. The model is
-    the object with y and z divided by stretches drawn from ``stretch``, so the true scale is (1,
-    s_y, s_z). The object's centre lies at a depth drawn from ``depth``, up to one unit off the
-    optical axis. ``noise_px`` is the standard deviation of the Gaussian noise on each image
-    coordinate; ``outlier_share`` of the observations, rounded to a whole number of them, are moved
-    to anywhere in the image instead. All randomness comes from ``rng``.
+    The object's points are uniform in the cube [-1, 1)^3, and the rotation is uniform. The model is
+    the object with y and z divided by scales drawn from ``stretch``, so the true scale is (1, s_y,
+    s_z). The object's centre is at a depth drawn from ``depth``, up to one unit off the optical
+    axis along x and y. ``noise_px`` is the standard deviation of the Gaussian noise on each image
+    coordinate. ``outlier_share`` of the observations, rounded to a whole number, are moved to
+    random pixels. All randomness comes from ``rng``.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Summaries of results: statistics of groups of rows, their table and their CSV file."""
+"""Summaries of results: statistics of groups of rows, for the console and as CSV."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Summary:
-    """Numbers of one method on one group of tasks: a row of ``summary.csv``, a line of a headline.
+    """Statistics of one method on one group of tasks: a row of ``summary.csv``.
 
-    ``names`` are the columns that name the row, the method among them; ``values`` numbers by
-    column, in the metrics' own units, NaN for what is unknown.
+    ``names`` are the cells that identify the row, with the method. ``values`` are numbers by
+    column, in the units of the result table; NaN if unknown.
     """
 
     group: str
@@ -47,7 +47,7 @@ class Summary:
         return self.names[column] if column in self.names else self.values[column]
 
     def number(self, key: str) -> float | None:
-        """The number of a metric; None if there is none."""
+        """The number of a metric; None if it is missing."""
         return self.values.get(key)
 
     def cells(self) -> Row:
@@ -57,10 +57,11 @@ class Summary:
 
 @dataclass(frozen=True)
 class ConsoleTable:
-    """A table for the console, with a note beneath.
+    """A table for the console, with a note below.
 
-    ``labels`` head the columns of texts, which come first, ``heads`` those of numbers. Rows that
-    differ in the first column are set apart in a grouped table, which does not repeat it.
+    ``labels`` are the heads of text columns, which come first; ``heads`` are the heads of numeric
+    columns. A grouped table separates rows that differ in the first column, and does not repeat
+    equal cells in it.
     """
 
     title: str
@@ -72,7 +73,7 @@ class ConsoleTable:
 
 
 def summary_csv(summaries: Sequence[Summary], *, rename: Mapping[str, str]) -> str:
-    """The summaries as a CSV file, some columns by another name; unknown cells are empty."""
+    """Format summaries as CSV; ``rename`` maps columns to other names. Unknown cells are empty."""
     rows = [summary.cells() for summary in summaries]
     head = [rename.get(name, name) for name in rows[0]]
     cells = [["" if value != value else value for value in row.values()] for row in rows]
@@ -80,14 +81,14 @@ def summary_csv(summaries: Sequence[Summary], *, rename: Mapping[str, str]) -> s
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Rows as a CSV file."""
+    """Format rows as CSV."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 class Group(NamedTuple):
-    """Rows of a method on a group of tasks: all that count, and those of them that are ok."""
+    """Rows of a method on a group of tasks: all that count, and the successful ones."""
 
     rows: Cells
     solved: Cells
@@ -101,11 +102,11 @@ def summarize(
     name: Callable[..., str] = str,
     apart: str = SKIPPED,
 ) -> list[Summary]:
-    """Statistics of every method on every group of tasks, and on all categories together.
+    """Summarize every method on every group of tasks, and on all categories together.
 
-    Tasks of a group share the cells of the columns ``by``, of which ``name`` makes its name;
-    without columns there is one group. Rows of the status ``apart`` do not count. Medians of the
-    run's further metrics are added.
+    Tasks of a group have equal cells in the columns ``by``; without columns there is one group.
+    ``name`` makes the group's name of these cells. Rows with the status ``apart`` do not count.
+    Medians of users' metrics are added.
     """
     cells = run.cells
     statistics = {**statistics, **{each.key: median(each.key) for each in run.metrics}}
@@ -120,9 +121,9 @@ def summarize(
         labels = [f"category {each}" if each == ALL else each for each in values]
         labels = [ALL if each is None else each for each in labels]
         for method in run.methods:
-            rows = where(cells, chosen & (cells["method"] == method))
-            rated = where(rows, rows["status"] != apart)
-            group = Group(rated, where(rated, rated["status"] == OK))
+            rows = select_rows(cells, chosen & (cells["method"] == method))
+            rated = select_rows(rows, rows["status"] != apart)
+            group = Group(rated, select_rows(rated, rated["status"] == OK))
             counts = [len(each["method"]) for each in (rows, *group)]
             if not counts[0]:
                 continue
@@ -135,12 +136,12 @@ def summarize(
 
 
 def medians(*columns: Metric) -> Statistics:
-    """The medians of columns, by their names."""
+    """Medians of columns, by column."""
     return {column.key: median(column.key) for column in columns}
 
 
 def median(key: str, factor: float = 1.0) -> Callable[[Group], float]:
-    """The median of a column, times a factor; NaN where a run lacks it."""
+    """The median of a column, times a factor; NaN if the run lacks the column."""
     return lambda group: median_of(factor * group.solved.get(key, np.empty(0)).astype(float))
 
 
@@ -150,7 +151,7 @@ def mean(key: str) -> Callable[[Group], float]:
 
 
 def share(is_within: Callable[[Cells], BoolArray]) -> Callable[[Group], float]:
-    """The share of rows that are ok and for which a condition holds; NaN of no row."""
+    """The share of rows that are ok and satisfy a condition; NaN without rows."""
 
     def made(group: Group) -> float:
         count = len(group.rows["method"])
@@ -160,20 +161,20 @@ def share(is_within: Callable[[Cells], BoolArray]) -> Callable[[Group], float]:
 
 
 milliseconds = median("seconds", 1e3)
-"""The median time."""
+"""Median time [ms]."""
 
 
 def group_name(group: Metric, value: Any) -> str:
-    """A group's name: the value that its tasks share, as shown."""
+    """A group's name: the common value of its tasks, in the metric's unit."""
     return value if isinstance(value, str) else f"{group.factor * value:g}"
 
 
-def where(cells: Cells, chosen: npt.NDArray[np.bool_]) -> Cells:
-    """The chosen rows."""
+def select_rows(cells: Cells, chosen: npt.NDArray[np.bool_]) -> Cells:
+    """Select rows by a mask (n,)."""
     return {name: column[chosen] for name, column in cells.items()}
 
 
-def known(values: npt.NDArray[Any]) -> FloatArray:
+def drop_nan(values: npt.NDArray[Any]) -> FloatArray:
     """The values (n,) that are not missing."""
     numbers = values.astype(float)
     return np.asarray(numbers[~np.isnan(numbers)])
@@ -181,11 +182,11 @@ def known(values: npt.NDArray[Any]) -> FloatArray:
 
 def median_of(values: npt.NDArray[Any]) -> float:
     """Median of the values (n,) that are not missing; NaN if all are."""
-    found = known(values)
+    found = drop_nan(values)
     return float(np.median(found)) if len(found) else np.nan
 
 
 def mean_of(values: npt.NDArray[Any]) -> float:
     """Mean of the values (n,) that are not missing; NaN if all are."""
-    found = known(values)
+    found = drop_nan(values)
     return float(found.mean()) if len(found) else np.nan

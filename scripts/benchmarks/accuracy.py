@@ -1,4 +1,4 @@
-"""Accuracy of the solvers against the Cramer-Rao bound, and times with learned shapes."""
+"""Accuracy of the solvers relative to the Cramer-Rao bound, and times with learned shapes."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from cadalign.metrics import rotation_error
 
 _ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0))
 _METHODS = ("optimal", "aepnp", "aepnp-paper")
-_LIMIT_DRAWS = 20  # of an ideal estimator's errors for each problem
+_LIMIT_DRAWS = 20  # errors of an ideal estimator per problem
 _SCALE_X = 6  # row of a bound
 _CATEGORIES = ("chair", "airplane", "mug")
 _NOISE_PX = 2.0  # of unseen objects
 
 
 def accuracy(given: BenchmarkData) -> Tables:
-    """Rotation errors over the Cramer-Rao bound: median and 90th percentile."""
+    """Rotation errors relative to the Cramer-Rao bound: median and 90th percentile."""
     rows = [_over_bound(*each, given.count or 2000, given.seed) for each in _ROWS]
-    yield "Rotation: the bound, and errors over it", rows
+    yield "Rotation errors: Cramer-Rao bound [deg], and ratios to it", rows
 
 
 def _over_bound(points: int, noise: float, count: int, seed: int) -> Row:
-    """Rotation errors of an ideal estimator, and those of every method relative to them."""
+    """Rotation errors of an ideal estimator [deg], and ratios of every method to them."""
     rng = np.random.default_rng(seed)
     problems = [simulate_problem(rng, points=points, noise_px=noise) for _ in range(count)]
     bounds = [section.attempt(cramer_rao_bound, each, sigma=noise) for each in problems]
@@ -46,17 +46,14 @@ def _over_bound(points: int, noise: float, count: int, seed: int) -> Row:
 
 
 def _error(problem: SimulatedProblem, method: str, sigma: float) -> float:
-    """Rotation error [deg]; 180 where the fit is refused."""
+    """Rotation error [deg]; 180 if the fit fails."""
     given = problem.points_3d, problem.points_2d, problem.camera
     found = section.attempt(cadalign.fit, *given, method=method, sigma=sigma)
     return 180.0 if found is None else rotation_error(est=found.alignment, gt=problem.alignment)
 
 
 def cramer_rao_bound(problem: SimulatedProblem, *, sigma: float) -> FloatArray:
-    """The least covariance (9, 9) of an unbiased estimate, as `cadalign.Result.covariance`.
-
-    It is the inverse of the Fisher information at the truth.
-    """
+    """Inverse Fisher information (9, 9) at the truth, ordered as `cadalign.Result.covariance`."""
     used = np.delete(np.arange(9), _SCALE_X)
     jacobian = projection_jacobian(problem.points_3d, problem.camera, problem.alignment)
     scaled, norms = scaled_columns(jacobian[:, :, used].reshape(-1, len(used)) / sigma)
@@ -77,11 +74,11 @@ def _ideal_errors(bound: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def shapes(given: BenchmarkData) -> Tables:
-    """Time of `align` of a view with a learned shape, and of a batch.
+    """Times of `align` with a learned shape, for one view and for a batch.
 
-    Objects are those of the split val, seen with up to 14 noisy keypoints; shape models are learned
-    from the split train. Times of single objects are those of the processor, warm and on one
-    thread; the batch holds every object five times and has two threads.
+    Objects are from the split val, with up to 14 noisy keypoints; shape models are learned from the
+    split train. Times of single views are processor times after warm-up, on one thread. The batch
+    holds every object five times and uses two threads.
     """
     yield "align with a learned shape", _shape_times(given)
 
@@ -96,7 +93,7 @@ def _shape_times(given: BenchmarkData) -> Iterator[Row]:
         for view in views[:2]:  # compile
             cadalign.align(shape, view)
         calls = (partial(cadalign.align, shape, view) for view in views)
-        one = [1e3 * section.clocked(call)[1] for call in calls]
+        one = [1e3 * section.clock(call)[1] for call in calls]
         batch = [[view] for view in views] * 5
         call = partial(cadalign.align_batch, shape, batch, workers=2)
         yield {

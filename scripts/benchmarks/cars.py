@@ -1,4 +1,4 @@
-"""Real cars of KITTI with keypoints of a network.
+"""Real cars of KITTI with keypoints from a network.
 
 Geiger et al., "Are we ready for Autonomous Driving? The KITTI Vision Benchmark Suite", CVPR 2012.
 The keypoints and the linear shape are those of Krishna et al., "Reconstructing Vehicles from a
@@ -25,27 +25,27 @@ from cadalign.metrics import box_iou
 from cadalign.shapes.basis import find_mirror, mirrored
 
 _LEAST_KEYPOINTS, _SURE = 6, 0.4  # score of a keypoint
-_CELLS = 64  # of a network's heatmap along the longer side of a car's rectangle
-_SIZE = (1242, 375)  # of a photo that is not there [px]
+_CELLS = 64  # cells of the network's heatmap along the longer side of a car's rectangle
+_SIZE = (1242, 375)  # [px], of missing photos
 _MEAN_CAR = np.array([1.63, 3.88, 1.53])  # width, length and height of cars in KITTI [m]
 _MODELS: dict[str, dict[str, Any]] = {  # options of the mean car's model
     "rigid": {"stretch": "none"},
     "stretched": {},
     "similar": {"shape_sigma": 0.04 * float(np.linalg.norm(_MEAN_CAR))},
 }
-_LENGTH_SIGMAS = (0.05, 0.11, 0.08)  # of their logs
-_MODE_DEVIATION = 1.5  # of modes of unit norm, on a mean of about 8 units of length
-_REST = 0.03  # what the modes leave of a keypoint's place [m]
+_LENGTH_SIGMAS = (0.05, 0.11, 0.08)  # of the logs of width, length and height
+_MODE_DEVIATION = 1.5  # of modes with unit norm; the mean car is about 8 units long
+_REST = 0.03  # [m], residual of keypoints beside the modes
 # The frame of models and boxes (x to the car's left, y to its rear, z up) from KITTI's object frame
 # (x forward, y down, z left at rotation_y = 0).
 _OBJECT_FROM_CAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 def cars(given: BenchmarkData) -> Tables:
-    """Cars of KITTI with at least 6 keypoints that score more than 0.4, by KITTI's metrics.
+    """Cars of KITTI with at least 6 keypoints of a score above 0.4, with KITTI's metrics.
 
-    Medians; of yaw with the 90th percentile. A tilted estimate counts as the upright box of its
-    heading, centre and extents.
+    Medians and 90th percentiles. A tilted estimate is replaced by the upright box with its heading,
+    centre and extents.
     """
     folder = given.folder("real", "kitti_cars")
     shape = _car_shape(folder)
@@ -53,23 +53,23 @@ def cars(given: BenchmarkData) -> Tables:
     methods = {
         each: partial(_errors, method=each, shape=shape) for each in ("epnp", *_MODELS, "shape")
     }
-    yield "Cars of KITTI", section.summaries(section.measured(seen, methods), "method")
+    yield "Cars of KITTI", section.summaries(section.measure(seen, methods), "method")
 
 
 class _Car(NamedTuple):
-    """A car in a photo: its sure keypoints, and its true box."""
+    """A car in a photo: its keypoints with high scores, and its true box."""
 
     camera: cadalign.Camera
     box: cadalign.Box
-    mean: dict[str, list[float]]  # places of all keypoints on the mean car by name [m]
+    mean: dict[str, list[float]]  # positions of all keypoints on the mean car by name [m]
     names: tuple[str, ...]  # (k,)
     points_2d: FloatArray  # (k, 2), [px]
-    side: float  # the longer one of its rectangle [px]
+    side: float  # longer side of its rectangle [px]
     bounds: FloatArray  # (2, 3), the mean car's box [m]
 
 
 def _read_cars(folder: Path) -> Iterator[_Car]:
-    """Every car in every frame."""
+    """All cars of all frames."""
     for each in json.loads((folder / "cars.json").read_text()):
         keypoints = {key: [mark[key] for mark in each["keypoints"]] for key in each["keypoints"][0]}
         image = folder / each["image"]
@@ -105,7 +105,7 @@ def _car_box(extents: Any, bottom: Any, yaw: float) -> cadalign.Box:
 
 
 def _car_bounds(points: FloatArray) -> FloatArray:
-    """The box (2, 3) of the mean car: keypoints reach to the roof, and at wheels to their hubs."""
+    """The box (2, 3) of the mean car; its top is at the highest keypoint."""
     low, high = points.min(axis=0), points.max(axis=0)
     center = np.array([*(low[:2] + high[:2]) / 2, high[2] - _MEAN_CAR[2] / 2])
     return np.array([center - _MEAN_CAR / 2, center + _MEAN_CAR / 2])
@@ -120,7 +120,7 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
     modes = np.loadtxt(folder / "vectors2.txt").reshape(-1, *points.shape) @ metres
     modes = np.concatenate([modes, [points * axis for axis in np.eye(3)]])
     deviations = [*[_MODE_DEVIATION] * (len(modes) - 3), *_LENGTH_SIGMAS]
-    # The mean of annotated cars is a little skew: its left wheel stands before its right one.
+    # The mean of annotated cars is slightly asymmetric, so it is averaged with its mirror image.
     rows = np.vstack([points, _car_bounds(points)])
     mirror = find_mirror(rows[None], axis=0)
     moved = mirrored(rows + np.pad(modes, ((0, 0), (0, 2), (0, 0))), mirror)
@@ -140,7 +140,7 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
 
 
 def _errors(car: _Car, *, method: str, shape: cadalign.ShapeModel) -> Row:
-    """Errors of yaw and depth, and the overlap of the upright boxes."""
+    """Errors of yaw and depth, and IoU of the upright boxes."""
     est, gt = _box_of(car, method, shape), car.box
     turn = _yaw(est.rotation) - _yaw(gt.rotation)
     return {
@@ -167,7 +167,7 @@ def _box_of(car: _Car, method: str, shape: cadalign.ShapeModel) -> cadalign.Box:
 
 
 def _yaw(rotation: FloatArray) -> float:
-    """KITTI's rotation_y [rad] of a rotation from a car's frame to the camera's."""
+    """KITTI's rotation_y [rad] of a rotation from car to camera."""
     forward = -rotation[:, 1]
     return float(np.arctan2(-forward[2], forward[0]))
 

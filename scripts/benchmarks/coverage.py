@@ -31,20 +31,20 @@ _NOISE_PX = 1.0
 
 
 def coverage(given: BenchmarkData) -> Tables:
-    """Coverage of stated uncertainties, of random objects in a unit cube with 1 px; warnings."""
-    yield "Truths within nominal 68, 95 % [%]", _regions(given.seed, given.count or 150)
-    yield from _warned(given)
+    """Coverage of stated uncertainties for random objects in a unit cube, 1 px; and warnings."""
+    yield "Truths inside regions of 68 and 95 % [%]", _regions(given.seed, given.count or 150)
+    yield from _warnings(given)
 
 
 def _regions(seed: int, count: int) -> Iterator[Row]:
-    methods = {kind: partial(_within, kind=kind) for kind in _KINDS}
+    methods = {kind: partial(_coverage, kind=kind) for kind in _KINDS}
     for points in _SIZES:
         cases = (({"keypoints": points}, (seed, points, number)) for number in range(count))
-        yield from section.summaries(section.measured(cases, methods), "method", "keypoints")
+        yield from section.summaries(section.measure(cases, methods), "method", "keypoints")
 
 
-def _within(stream: tuple[int, int, int], *, kind: str) -> Row:
-    """Of an estimate of one kind: do its regions of rotation, shift and lengths hold the truth?"""
+def _coverage(stream: tuple[int, int, int], *, kind: str) -> Row:
+    """Whether the regions of rotation, translation and lengths hold the truth, for one estimate."""
     rng, points = np.random.default_rng(stream), stream[1]
     model = rng.uniform(-0.5, 0.5, (points, 3))
     scale = np.array([1.0, *np.exp(rng.normal(0, _STRETCH_SIGMA, 2))])
@@ -93,7 +93,7 @@ _LARGE_DEG, _REGION = 10.0, 0.999
 
 
 class _Case(NamedTuple):
-    """A model, its noisy keypoints in a view by id, the object's pose, and options of `align`."""
+    """Input of `align`: model, noisy keypoints with ids, camera and options; and the true pose."""
 
     model: Model | ShapeModel
     ids: list[int]
@@ -103,21 +103,21 @@ class _Case(NamedTuple):
     options: Mapping[str, Any] = MappingProxyType({})
 
 
-def _warned(given: BenchmarkData) -> Tables:
-    """Warnings on right data and on mistakes, of objects of KeypointNet's split val.
+def _warnings(given: BenchmarkData) -> Tables:
+    """Rates of warnings on correct and on faulty data, with objects of KeypointNet's split val.
 
-    Models are the object's own one, stretched; the same with its keypoints displaced; and the shape
-    that was learned from the split train. A mistake is silent if the rotation is more than 10
-    degrees off, outside of the stated 99.9 % region, without a warning and without an alternative
-    nearer than that.
+    Models are the object's own model, stretched; the same with displaced keypoints; and the shape
+    learned from the split train. An error is silent if there is no warning, the rotation error of
+    the estimate and of every alternative exceeds 10 degrees, and the truth is outside the stated
+    99.9 % region.
     """
     cases = _cases(given, given.count or 40)
-    rows = section.measured(cases, {"align": _outcome})
-    yield "Right data and mistakes [%]", section.summaries(rows, "mistake", "model")
+    rows = section.measure(cases, {"align": _outcome})
+    yield "Correct and faulty data [%]", section.summaries(rows, "mistake", "model")
 
 
 def _cases(given: BenchmarkData, count: int) -> Iterator[tuple[Row, _Case]]:
-    """Every object, model and mistake."""
+    """All objects with all models and mistakes."""
     root = given.folder("keypointnet")
     categories = list(KeypointNet(root).categories)
     for category, other in zip(categories, (categories[-1], *categories), strict=False):
@@ -133,7 +133,7 @@ def _cases(given: BenchmarkData, count: int) -> Iterator[tuple[Row, _Case]]:
 
 
 def _models(seen: UnseenObject, shape: ShapeModel, rng: np.random.Generator) -> dict[str, _Case]:
-    """The right data of an object by model and options."""
+    """Correct data of an object, by model and options."""
     points, ids = seen.xyz[seen.rows], seen.ids.tolist()
     stretched = points / np.exp(np.append(0.0, rng.normal(0, _STRETCH_SIGMA, 2)))
     moved = stretched + rng.normal(0, _DISPLACED, points.shape)
@@ -158,7 +158,7 @@ def _models(seen: UnseenObject, shape: ShapeModel, rng: np.random.Generator) -> 
 def _mistakes(
     case: _Case, foreign: ShapeModel, rng: np.random.Generator
 ) -> Iterator[tuple[str, _Case]]:
-    """The case as it is, and with each mistake."""
+    """The unchanged case, and the case with each mistake."""
     yield "none", case
     pixels, last = case.points_2d, np.subtract((640, 480), 2 * PIXEL_CENTRE)
     row, angle = int(rng.integers(len(pixels))), rng.uniform(0, 2 * np.pi)
@@ -185,7 +185,7 @@ def _mistakes(
 
 
 def _outcome(case: _Case) -> Row:
-    """The estimate of a case: is it warned of, or silently wrong?"""
+    """Whether an estimate has a warning, and whether it is silently wrong."""
     view = View(case.camera, case.points_2d, ids=case.ids, sigma=_WARNED_PX)
     result = cadalign.align(case.model, view, **case.options)
     poses = [result.alignment, *(each.alignment for each in result.alternatives)]

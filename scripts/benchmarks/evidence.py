@@ -1,4 +1,4 @@
-"""Evidence beside keypoints: errors, and how near they come to the Cramer-Rao bound."""
+"""Errors with evidence beside keypoints, relative to the Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ _LENGTH_SIGMA = 0.01  # relative
 _TURN_DEG = 25.0  # about the object, between neighbouring cameras
 _TURNS = (0, 1, -1, 2, -2)  # places of the cameras around the object
 _LEAST_KEYPOINTS = 6
-_LEAST_FREE = 3  # keypoints of a view that moved in an unknown way
-_DRAWS = 1000  # of an ideal estimator's errors
+_LEAST_FREE = 3  # keypoints of a view with unknown motion
+_DRAWS = 1000  # errors of an ideal estimator
 _WANDER = 2.0  # [px], standard deviation of a smoothed contour
-_WANDER_LENGTH = 5.0  # [px], over which it wanders
+_WANDER_LENGTH = 5.0  # [px], correlation length of that noise
 _HIDDEN = 0.25  # share of the area
 _KINDS = (
     *("keypoints", "gravity", "length", "depth", "views-2-free", "views-5-free", "views-2"),
     *("views-5", "mask-exact", "mask-dilated", "mask-hidden", "mask-smoothed"),
 )
-_FIELDS = {  # of a view by the kind that uses them
+_FIELDS = {  # fields of a view, by kind of evidence
     "depth": ("depth", "depth_sigma"),
     "gravity": ("up", "up_sigma_deg"),
     "views-2": ("cam_from_rig",),
@@ -52,13 +52,13 @@ _FIELDS = {  # of a view by the kind that uses them
 
 
 def evidence(given: BenchmarkData) -> Tables:
-    """Errors with keypoints alone, and with one kind of further evidence.
+    """Errors with keypoints only, and with one kind of further evidence.
 
-    Each view shows a model with a mesh as it is; the alignment gets its visible keypoints with
-    noise of 1 px and the model stretched by factors from 0.5 to 2 along y and z. The last column is
-    the ratio of the rotation error to that of an ideal estimator, from the inverse of the Fisher
-    information of the view without noise; masks, whose noise is estimated from themselves, have
-    none. Views with -free have an unknown motion.
+    Each view shows a model with a mesh. The alignment gets the visible keypoints with 1 px of noise
+    and the model stretched by factors from 0.5 to 2 along y and z. The last column is the ratio of
+    the rotation error to an ideal estimator's, from the inverse Fisher information of the view
+    without noise. Masks have no ratio, as their noise is estimated. Views with -free have unknown
+    motion.
     """
     dataset = KeypointNet(given.folder("keypointnet")).subset(with_mesh=True)
     cases = []
@@ -68,14 +68,14 @@ def evidence(given: BenchmarkData) -> Tables:
             drawn = draw(noise=1.0), draw(noise=0.0)
             if None not in drawn:
                 cases.append(({}, drawn))
-    methods = {kind: partial(_measured, kind) for kind in _KINDS}
-    rows = list(section.measured(cases, methods))
+    methods = {kind: partial(_measure, kind) for kind in _KINDS}
+    rows = list(section.measure(cases, methods))
     yield f"evidence beside keypoints, {len(cases)} views", section.summaries(rows, "method")
 
 
 @dataclass(frozen=True, eq=False)
 class SeenObject:
-    """An object before several cameras, and its stretched model."""
+    """An object seen by several cameras, and its stretched model."""
 
     category: str
     instance: Instance  # in the first camera
@@ -91,11 +91,11 @@ class SeenObject:
 
 
 def draw_object(model: AnnotatedModel, view: int, *, noise: float, seed: int) -> SeenObject:
-    """Draw a view of a model, its stretch, the other cameras, and the noise of everything.
+    """Draw a view of a model, its stretch, further cameras, and all noise.
 
-    Everything random follows from (seed, category, model id, view). The cameras turn about the
-    vertical axis of the first one through the centre of the object's box. ``noise`` is that of the
-    keypoints [px], and a factor on all other.
+    The result depends only on (seed, category, model id, view) and ``noise``. The cameras are
+    rotated about a vertical axis through the centre of the object's box. ``noise`` is the standard
+    deviation of the keypoints [px], and a factor of all other noise.
     """
     rng_of = partial(instance_rng, seed, model.category, model.model_id, str(view))
     how: Row = {"noise_px": noise, "min_visible": _LEAST_KEYPOINTS, "seed": seed}
@@ -127,7 +127,7 @@ def draw_object(model: AnnotatedModel, view: int, *, noise: float, seed: int) ->
 def _view(
     instance: Instance, xyz: FloatArray, motion: FloatArray, rng: np.random.Generator, noise: float
 ) -> View:
-    pose = moved(instance.cam_from_model, motion)
+    pose = move(instance.cam_from_model, motion)
     of_pixels = noise * rng.standard_normal((len(xyz), 2))
     of_depths = noise * _DEPTH_SIGMA * rng.standard_normal(len(xyz))
     about = noise * np.radians(_UP_SIGMA_DEG) * rng.standard_normal(2)
@@ -139,21 +139,21 @@ def _view(
         ids=rows.tolist(),
         depth=in_camera[:, 2] * (1 + of_depths[rows]),
         depth_sigma=_DEPTH_SIGMA,
-        # The model's y axis, turned about the two axes across it.
+        # The model's y axis, rotated about the other two axes.
         up=rotation_from_vector(pose.rotation[:, [0, 2]] @ about) @ pose.rotation[:, 1],
         up_sigma_deg=_UP_SIGMA_DEG,
         cam_from_rig=motion,
     )
 
 
-def moved(pose: Alignment, motion: FloatArray) -> Alignment:
-    """A pose in the first camera as another camera has it, after its motion (4, 4)."""
+def move(pose: Alignment, motion: FloatArray) -> Alignment:
+    """Transform a pose from the first camera to another one by the motion (4, 4) between them."""
     rotation, shift = motion[:3, :3], motion[:3, 3]
     return Alignment(rotation @ pose.rotation, rotation @ pose.translation + shift, pose.scale)
 
 
-def aligned(kind: str, seen: SeenObject) -> Result:
-    """The estimate from keypoints and a kind of evidence."""
+def align_with(kind: str, seen: SeenObject) -> Result:
+    """Estimate from keypoints and one kind of evidence."""
     count = int(kind.split("-")[1]) if kind.startswith("views") else 1
     first, *others = seen.views[:count]
     if kind.endswith("-free"):
@@ -168,9 +168,9 @@ def aligned(kind: str, seen: SeenObject) -> Result:
     return align(seen.model, views, size=size)
 
 
-def _measured(kind: str, drawn: tuple[SeenObject, SeenObject]) -> Row:
+def _measure(kind: str, drawn: tuple[SeenObject, SeenObject]) -> Row:
     (noisy, ideal), instance = drawn, drawn[0].instance
-    est, gt = aligned(kind, noisy).alignment, instance.gt
+    est, gt = align_with(kind, noisy).alignment, instance.gt
     errors = alignment_errors(est=est, gt=gt, length=instance.diagonal)
     est_box, gt_box = (Box.from_model(instance.bounds, each) for each in (est, gt))
     box_iou = overlap(est=est_box, gt=gt_box)
@@ -184,16 +184,15 @@ def _measured(kind: str, drawn: tuple[SeenObject, SeenObject]) -> Row:
     }
     if kind.startswith("mask"):
         return row
-    bound = aligned(kind, ideal).fisher_covariance
+    bound = align_with(kind, ideal).fisher_covariance
     turns = noisy.rng_of("bound").multivariate_normal(np.zeros(9), bound, _DRAWS, method="eigh")
     turn = float(np.median(np.degrees(np.linalg.norm(turns[:, :3], axis=1))))
     return row | {"R over bound": errors["rotation_error_deg"] / turn}
 
 
 def damaged_mask(mask: BoolArray, kind: str, rng: np.random.Generator) -> BoolArray:
-    """A mask (h, w) with a damage.
-
-    It is exact, dilated by 2 px, smoothed (its contour wanders by 2 px), or a quarter is hidden.
+    """Damage a mask (h, w): exact, dilated (by 2 px), smoothed (contour noise of 2 px), or hidden
+    (a quarter of the area).
     """
     pixels = mask.astype(np.uint8)
     if kind == "dilated":

@@ -1,4 +1,4 @@
-"""Photos as evidence beside rough clicks, on composites with exact truth and on real photos."""
+"""Photos as evidence beside rough clicks: composites with exact truth, and real photos."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _CLICKS = 6
 _CLICK_SHARE = 4.0 / 640.0  # standard deviation of a click, relative to the photo's width
 _STRETCH_SIGMA = 0.3
 _WORSE_DEG = 1.0
-_INNER = 0.95  # probability of the regions whose coverage is counted
+_INNER = 0.95  # probability of the regions for coverage
 
 
 def photo(given: BenchmarkData) -> Tables:
-    """Rough clicks alone, and with the photo.
+    """Errors with rough clicks only, and with the photo.
 
-    Six clicks with an error of 4 px in a photo 640 px wide. Composites are models of ShapeNet and
-    of the sample dataset, rendered before real photos with varied light, blur and noise, a quarter
-    of them partly hidden; their truth is exact. Real photos are those of HANDAL, LINEMOD and
-    Linemod-Occluded, whose stated truth is off by some pixels in places, with several draws of the
-    clicks on each.
+    Each photo has six clicks with an error of 4 px at a width of 640 px. Composites are models of
+    ShapeNet and of the sample dataset, rendered in front of real photos with varied light, blur and
+    noise; a quarter are partly hidden. Their truth is exact. Real photos are from HANDAL, LINEMOD
+    and Linemod-Occluded, with several draws of clicks each. Their annotated poses are off by some
+    pixels in places.
     """
     draws = given.count or 25
     cases = [(case, 1) for case in _composites(given, 8 * draws)]
@@ -48,7 +48,7 @@ def photo(given: BenchmarkData) -> Tables:
     occluded = _occluded(given.folder("real", "lmo_multiview"))
     cases += [(case, max(draws // 5, 1)) for case in occluded]
     rows = [
-        {"model": model, "photos": case.group} | _compared(case, _clicked(case, rng, model))
+        {"model": model, "photos": case.group} | _compare(case, _draw_clicks(case, rng, model))
         for model in ("rigid", "stretched")
         for number, (case, count) in enumerate(cases)
         for rng in (np.random.default_rng([given.seed, 3, number, draw]) for draw in range(count))
@@ -58,7 +58,7 @@ def photo(given: BenchmarkData) -> Tables:
 
 @dataclass(frozen=True)
 class PhotoCase:
-    """An object in a photo: its model and the true alignment."""
+    """An object in a photo: its mesh and true alignment."""
 
     group: str
     camera: Camera
@@ -69,7 +69,7 @@ class PhotoCase:
 
 
 class Clicks(NamedTuple):
-    """Clicks (6, 2) in a photo [px], the model that they are on, and the true alignment."""
+    """Clicks (6, 2) in a photo [px], the model with the clicked points, and the true alignment."""
 
     model: Model
     truth: Alignment
@@ -77,8 +77,8 @@ class Clicks(NamedTuple):
     sigma: float
 
 
-def _clicked(case: PhotoCase, rng: np.random.Generator, model: str) -> Clicks:
-    """Rough clicks on points spread over the visible surface."""
+def _draw_clicks(case: PhotoCase, rng: np.random.Generator, model: str) -> Clicks:
+    """Draw rough clicks on points spread over the visible surface."""
     is_stretched = model == "stretched"
     scale = np.exp(rng.normal(0, _STRETCH_SIGMA, 3) * [0, 1, 1]) if is_stretched else np.ones(3)
     truth = replace(case.truth, scale=scale)
@@ -98,15 +98,15 @@ def _clicked(case: PhotoCase, rng: np.random.Generator, model: str) -> Clicks:
     return Clicks(clicked, truth, places + rng.normal(0, sigma, places.shape), sigma)
 
 
-def _compared(case: PhotoCase, clicks: Clicks) -> Row:
-    """Errors by the clicks and with the photo: rotation [deg], stretch."""
+def _compare(case: PhotoCase, clicks: Clicks) -> Row:
+    """Errors without and with the photo: rotation [deg], stretch; and coverage with the photo."""
 
     def aligned(**evidence: Any) -> Result:
         view = View(case.camera, clicks.pixels, sigma=clicks.sigma, **evidence)
         return align(clicks.model, view)
 
-    first, _, alone = section.clocked(aligned)
-    second, _, joint = section.clocked(partial(aligned, image=case.pixels))
+    first, _, alone = section.clock(aligned)
+    second, _, joint = section.clock(partial(aligned, image=case.pixels))
     row: Row = {}
     for name, result in (("clicks", alone), ("photo", joint)):
         est = result.alignment
@@ -125,7 +125,7 @@ def _compared(case: PhotoCase, clicks: Clicks) -> Row:
 
 
 def _spread_places(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Pixels (6, 2) inside a mask, each far from those before it."""
+    """Pixels (6, 2) inside a mask, far from each other."""
     inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8))
     rows, columns = np.nonzero(inside if inside.sum() > 10 * _CLICKS else mask)
     places = np.column_stack([columns, rows])
@@ -133,7 +133,7 @@ def _spread_places(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     chosen = [some[0]]
     for _ in range(_CLICKS - 1):
         gaps = np.linalg.norm(some[:, None] - np.array(chosen), axis=2).min(axis=1)
-        # Among the farthest: people click on what is marked, not on the extremes alone.
+        # One of the farthest 2 %: people do not only click on extreme points.
         likely = np.argsort(-gaps)[: max(len(some) // 50, 1)]
         chosen.append(some[rng.choice(likely)])
     return np.array(chosen)
@@ -143,23 +143,23 @@ def _spread_places(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _samples(root: Path) -> Iterator[PhotoCase]:
-    """Objects of HANDAL and LINEMOD, by poses.json: {photo: {model, cam_from_model, camera}}."""
+    """Objects of HANDAL and LINEMOD; poses.json: {photo: {model, cam_from_model, camera}}."""
     for name, entry in json.loads((root / "poses.json").read_text()).items():
         pose, group = np.array(entry["cam_from_model"]), (root / name).parent.name
-        yield _posed(root / name, group, entry["camera"], root / entry["model"], pose)
+        yield _read_case(root / name, group, entry["camera"], root / entry["model"], pose)
 
 
 def _occluded(root: Path) -> Iterator[PhotoCase]:
-    """Objects of Linemod-Occluded, by scene_gt.json: {photo: [{cam_R_m2c, cam_t_m2c, obj_id}]}."""
+    """Objects of Linemod-Occluded; scene_gt.json: {photo: [{cam_R_m2c, cam_t_m2c, obj_id}]}."""
     camera = json.loads((root / "camera.json").read_text())
     for number, objects in json.loads((root / "scene_gt.json").read_text()).items():
         for each in objects:
             model = root / "models" / f"obj_{each['obj_id']:06d}.ply"
             pose = np.column_stack([np.reshape(each["cam_R_m2c"], (3, 3)), each["cam_t_m2c"]])
-            yield _posed(root / "rgb" / f"{int(number):06d}.png", "lmo", camera, model, pose)
+            yield _read_case(root / "rgb" / f"{int(number):06d}.png", "lmo", camera, model, pose)
 
 
-def _posed(photo: Path, group: str, fields: Row, model: Path, pose: FloatArray) -> PhotoCase:
+def _read_case(photo: Path, group: str, fields: Row, model: Path, pose: FloatArray) -> PhotoCase:
     camera = Camera(*(fields[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
     truth = Alignment(nearest_rotation(pose[:3, :3]), pose[:3, 3], np.ones(3))
     return PhotoCase(group, camera, read_photo(photo), load_mesh(model), truth)
@@ -169,7 +169,7 @@ def _posed(photo: Path, group: str, fields: Row, model: Path, pose: FloatArray) 
 
 
 def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
-    """Models of ShapeNet and of the sample, rendered before real photos; some partly hidden."""
+    """Render models of ShapeNet and of the sample dataset in front of real photos."""
     root = given.folder()
     with tempfile.TemporaryDirectory() as folder:
         sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=2))
@@ -195,7 +195,7 @@ def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
         drawn = frame.composite(np.ascontiguousarray(pixels))
         is_hidden = number % 4 == 3
         if is_hidden:
-            drawn = _hidden(drawn, frame.mask, behind[rng.integers(len(behind))], rng)
+            drawn = _hide(drawn, frame.mask, behind[rng.integers(len(behind))], rng)
         group = f"composite {'hidden' if is_hidden else 'clear'}"
         drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
         noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
@@ -203,10 +203,10 @@ def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
         yield PhotoCase(group, _CAMERA, photo, scene.mesh, truth, model.symmetry)
 
 
-def _hidden(
+def _hide(
     drawn: np.ndarray, mask: np.ndarray, other: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Cover about a fifth of the object by a round patch of another photo."""
+    """Hide about a fifth of the object behind a disc of another photo."""
     rows, columns = np.nonzero(mask)
     at = rng.integers(len(rows))
     radius = float(np.sqrt(0.3 * len(rows) / np.pi))

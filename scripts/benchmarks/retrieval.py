@@ -1,4 +1,4 @@
-"""Retrieval: time of queries, and objects that are not in the library."""
+"""Retrieval: times of queries, and accuracy for objects outside of the library."""
 
 from __future__ import annotations
 
@@ -35,44 +35,43 @@ _CATEGORIES = ("chair", "airplane", "bottle", "mug", "guitar")
 
 
 def retrieval(given: BenchmarkData) -> Tables:
-    """Time of queries, and objects that are not in the library."""
+    """Times of queries, and accuracy for objects outside of the library."""
     yield from _times(given)
     yield "First matches", _unseen(given)
 
 
 def _times(given: BenchmarkData) -> Tables:
-    """Time of a query, for real models and growing synthetic libraries.
+    """Times of queries among real models, and in growing synthetic libraries.
 
-    The synthetic models are the real ones with their keypoints moved by 3 % of the extent, models
-    of all categories are compared. Times are the least of three calls with as many threads as there
-    are cores, after warm-up.
+    Synthetic models are real ones with keypoints moved by 3 % of the extent. Queries compare models
+    of all categories. Times are the minimum of three calls after warm-up, with one thread per core.
     """
     real = list(Library.from_models(KeypointNet(given.folder("keypointnet"))))
     mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
     for size in (len(real), *given.sizes):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "library")
-            _jittered(mixed, size).save(path)
+            _jitter(mixed, size).save(path)
             title = f"Queries among {size:,} models, {path.stat().st_size / 1e6:.1f} MB"
             yield title, _queries(path, mixed[:size], given.count or 20)
 
 
 def _queries(path: Path, models: Sequence[LibraryModel], count: int) -> Iterator[Row]:
-    opening, _, library = section.clocked(partial(Library.open, path))
+    opening, _, library = section.clock(partial(Library.open, path))
     yield {"call": "opening", "median ms": 1e3 * opening}
     shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
     for noise_px in (1.0, 3.0, 5.0):
         calls = [
             partial(library.retrieve, seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
-            for seen in islice(_observed(shown, noise_px, seed=0), count)
+            for seen in islice(_observe(shown, noise_px, seed=0), count)
         ]
         calls[0]()  # warm-up
-        times = [1e3 * min(section.clocked(call)[0] for _ in range(_CALLS)) for call in calls]
+        times = [1e3 * min(section.clock(call)[0] for _ in range(_CALLS)) for call in calls]
         name = f"query, {noise_px:g} px"
         yield {"call": name, "median ms": float(np.median(times)), "longest ms": max(times)}
 
 
-def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
+def _jitter(models: Sequence[LibraryModel], count: int) -> Library:
     rng = np.random.default_rng(0)
     filled = list(models[:count])
     while len(filled) < count:
@@ -84,7 +83,7 @@ def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
     return Library.from_models(filled)
 
 
-def _observed(
+def _observe(
     models: Sequence[LibraryModel], noise_px: float, *, seed: int
 ) -> Iterator[RetrievalQuery]:
     for model in models:
@@ -95,12 +94,12 @@ def _observed(
 
 
 def _unseen(given: BenchmarkData) -> Iterator[Row]:
-    """Retrieval of objects that are not in the library: box IoU up to scale of the first match.
+    """Box IoU up to scale of the first match, for objects outside of the library.
 
-    Objects are those of the split val, with all keypoints and 2 px of noise; shape models are
-    learned from the split train. The library holds all models but the object's own and those that
-    are the same after a stretch. Rankings are by the fit of each model, exact or with an
-    uncertainty of its shape, and by the estimated shape. Boxes are those of the keypoints.
+    Objects are from the split val, with all keypoints and 2 px of noise; shape models are learned
+    from the split train. The library lacks the object's own model and all models that equal it
+    after a stretch. Models are ranked by their fit, exact or with an uncertain shape, or by the
+    estimated shape. Boxes enclose the keypoints.
     """
     root = given.folder("keypointnet")
     for category in _CATEGORIES:
@@ -119,11 +118,11 @@ def _unseen(given: BenchmarkData) -> Iterator[Row]:
             name: partial(_first_iou, partial(library.retrieve, category=category, **options))
             for name, options in rankings.items()
         }
-        yield from section.summaries(section.measured(cases, methods), "category", "method")
+        yield from section.summaries(section.measure(cases, methods), "category", "method")
 
 
 def _first_iou(retrieve: Callable[..., list[Match]], case: tuple[View, Box, Any]) -> Row:
-    """IoU of the first match of a query; 0 where there is none, or a flat one."""
+    """IoU of the first match of a query; 0 without a match, or if its box is flat."""
     view, gt, same = case
     seen = view.points_2d, view.ids, KEYPOINT_CAMERA
     how: Row = {"top": 1, "sigma": _NOISE_PX, "exclude": same, "workers": 1}

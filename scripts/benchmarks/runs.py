@@ -1,4 +1,4 @@
-"""Rates of whole runs, and the robust search in real correspondences."""
+"""Throughput and memory of runs, and RANSAC on real correspondences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
 from cadalign import Camera, RansacOptions
 from cadalign.datasets import Colmap, Correspondences, KeypointNet
-from cadalign.evaluation.experiments.correspondences import errors_of, spoil
+from cadalign.evaluation.experiments.correspondences import errors_of, make_problem
 from cadalign.evaluation.methods import MethodInput
 
 _POINTS = 8
@@ -28,10 +28,10 @@ _SEARCH = {"max_reproj_error": 4.0, "success_prob": 0.9999}
 
 
 def runs(given: BenchmarkData) -> Tables:
-    """Fits of many observations, evaluations on annotations, and the robust search.
+    """Fits of many observations, evaluations on annotations, and RANSAC.
 
-    Rates are those of what a longer run of two processes does more than a shorter one: neither
-    start nor figures are in them. The memory's ratio is that of the two runs.
+    Throughput is the difference of a longer and a shorter run with two processes, without start-up
+    and figures. The memory's ratio is longer over shorter run.
     """
     with tempfile.TemporaryDirectory() as folder:
         files = [_write_observations(Path(folder), n, given.seed) for n in _SIZES]
@@ -48,11 +48,11 @@ def runs(given: BenchmarkData) -> Tables:
     count = (_VIEWS[1] - _VIEWS[0]) * len(KeypointNet(root))
     rows = list(_rate_and_memory("evaluation on annotations", count, *pair))
     yield "Evaluations", [*rows, _dask_over_processes("evaluation", [*call, "--views-per-model=3"])]
-    yield "Robust search", _ransac(given)
+    yield "RANSAC on real correspondences", _ransac(given)
 
 
 def _rate_and_memory(name: str, count: int, shorter: list[str], longer: list[str]) -> Iterator[Row]:
-    (short, less), (long, more) = (_used(*call, "--workers=2") for call in (shorter, longer))
+    (short, less), (long, more) = (_measure(*call, "--workers=2") for call in (shorter, longer))
     yield {"name": name, "value": count / (long - short), "unit": "1/s"}
     yield section.figure(f"{name}, memory", more, "MB", more / less, "the shorter run")
 
@@ -61,14 +61,14 @@ def _dask_over_processes(name: str, call: list[str]) -> Row:
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        dask, _ = _used(*call, f"--dask={cluster.scheduler_address}")
-    processes, _ = _used(*call, "--workers=2")
+        dask, _ = _measure(*call, f"--dask={cluster.scheduler_address}")
+    processes, _ = _measure(*call, "--workers=2")
     return section.figure(f"{name}, two Dask workers", dask, "s", dask / processes, "two processes")
 
 
-def _used(*call: str) -> tuple[float, float]:
+def _measure(*call: str) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
-        return section.used_by([*COMMAND, *call, f"--out={folder}/run"])
+        return section.measure_command([*COMMAND, *call, f"--out={folder}/run"])
 
 
 def _write_observations(folder: Path, count: int, seed: int) -> Path:
@@ -90,15 +90,14 @@ def _write_observations(folder: Path, count: int, seed: int) -> Path:
     return path
 
 
-# Robust search ------------------------------------------------------------------------------------
+# RANSAC -------------------------------------------------------------------------------------------
 
 
 def _ransac(given: BenchmarkData) -> Iterator[Row]:
-    """The robust search on real correspondences: success, and time over PoseLib's.
+    """RANSAC on real correspondences: success rate, and time relative to PoseLib's.
 
-    Images are those of `cadalign evaluate correspondences`: scales are drawn anew for every image
-    and draw, and a share of the points is moved to anywhere. PoseLib gets the true scales: it
-    solves the easier problem without stretch.
+    Problems are drawn as in `cadalign evaluate correspondences`. PoseLib gets the true scales, so
+    it solves the easier problem without stretch.
     """
     images = list(Colmap(given.folder("sfm", "maupertuis_colmap")))
     for share in (0.0, 0.2, 0.5, 0.8, 0.9):
@@ -108,10 +107,10 @@ def _ransac(given: BenchmarkData) -> Iterator[Row]:
         for draw in range(given.count or 20):
             options = RansacOptions(**_SEARCH, max_iterations=iterations, seed=draw)
             for image in images:
-                truth = spoil(image, share, rng=rng)
+                truth = make_problem(image, share, rng=rng)
                 problem = truth.points_3d, truth.points_2d, truth.camera
                 call = partial(section.attempt, cadalign.fit, *problem, ransac=options)
-                wall, _, result = section.clocked(call)
+                wall, _, result = section.clock(call)
                 ours.append(wall)
                 known = MethodInput.of_problem(truth, 1.0)
                 succeeded.append(result is not None and errors_of(result, known)["success"])

@@ -1,4 +1,4 @@
-"""Harness of the sections of `bench.py`: their data, cases by methods into tables, and clocks."""
+"""Shared code of the sections of `bench.py`: data, tables of methods on cases, and clocks."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ from cadalign.evaluation.instances.unseen import UnseenObject, observe_object, u
 from cadalign.geometry.rotations import vector_from_rotation
 
 COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
-"""What runs `cadalign`, wherever it is installed."""
+"""The command `cadalign` of this Python."""
 _DATA = Path(os.environ["CADALIGN_DATA"]) if os.environ.get("CADALIGN_DATA") else None
 
 Row = dict[str, Any]
 Table = tuple[str, Iterable[Row]]
-"""A title, and rows by column; a cell may be a median with a 90th percentile."""
+"""A title and rows; a cell may be a pair of median and 90th percentile."""
 Tables = Iterator[Table]
 T = TypeVar("T")
 
 
 @dataclass(kw_only=True)
 class BenchmarkData:
-    """Data, seed and choice of the sections; CADALIGN_DATA names the folder of the data."""
+    """Data, seed and choice of sections."""
 
     data: Path | None = _DATA
-    """Folder of the data; some sections need it, others use it."""
+    """Folder of the data, which some sections need; CADALIGN_DATA by default."""
     seed: int = 0
-    """Seed of random problems."""
+    """Seed of the random number generators."""
     count: int | None = None
-    """Problems, objects, queries or calls of a row; by default the section's own number."""
+    """Number of problems, objects, queries or calls per row; the default depends on the section."""
     sizes: tuple[int, ...] = (50_000,)
-    """Models of the synthetic libraries of the section retrieval."""
+    """Numbers of models in the synthetic libraries of the section retrieval."""
     sections: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Sections to run; by default all that need no asking for."""
+    """Sections to run; all except evidence, photo and cars by default."""
 
     def folder(self, *parts: str) -> Path:
-        """A folder of the data; DataError where none are given."""
+        """A folder of the data; raises DataError if there is no data."""
         if self.data is None:
-            raise DataError("give --data, or CADALIGN_DATA")
+            raise DataError("give --data, or set CADALIGN_DATA")
         return self.data.joinpath(*parts)
 
 
@@ -65,19 +65,19 @@ Section = Callable[[BenchmarkData], Tables]
 
 
 def attempt(call: Callable[..., T], *given: Any, **options: Any) -> T | None:
-    """Call a function; None where it raises a CadalignError."""
+    """Call a function; None if it raises a CadalignError."""
     try:
         return call(*given, **options)
     except CadalignError:
         return None
 
 
-def measured(
+def measure(
     cases: Iterable[tuple[Row, T]], methods: Mapping[str, Callable[[T], Row]]
 ) -> Iterator[Row]:
-    """The labels of each case, a method's name, and what the method measures of the case.
+    """Run methods on cases: rows with the case's labels, the method's name, and its measurements.
 
-    What is refused by a CadalignError gives no row.
+    A CadalignError gives no row.
     """
     for labels, case in cases:
         for name, measure in methods.items():
@@ -87,10 +87,10 @@ def measured(
 
 
 def summaries(rows: Iterable[Row], *by: str) -> list[Row]:
-    """Rows that agree in the columns ``by`` as one: their number, and a summary of each column.
+    """Summarize groups of rows with equal cells in the columns ``by``.
 
-    It is the share of flags [%], of other numbers the median and the 90th percentile; cells that
-    are None or missing are left out.
+    A summary has the number of rows, the share of true flags [%], and median and 90th percentile of
+    other numbers. Cells that are None or missing do not count.
     """
     groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
     for row in rows:
@@ -112,7 +112,7 @@ def spread(values: Any) -> tuple[float, float]:
 
 
 def figure(name: str, value: float, unit: str, ratio: float, to: str) -> Row:
-    """A measured figure, and its ratio to other work, which depends little on the machine."""
+    """A row with a measured value, and its ratio to a reference measured on the same machine."""
     return {"name": name, "value": value, "unit": unit, "ratio": ratio, "to": to}
 
 
@@ -133,7 +133,7 @@ def _cell(value: Any) -> str:
 
 
 def deviation(*, est: cadalign.Alignment, gt: cadalign.Alignment) -> FloatArray:
-    """Errors (9,) in the order of a covariance: turn [rad], shift, logarithms of the scales."""
+    """Errors (9,) in the order of a covariance: rotation [rad], translation, logs of scales."""
     turn = vector_from_rotation(est.rotation @ gt.rotation.T)
     return np.concatenate([turn, est.translation - gt.translation, np.log(est.scale / gt.scale)])
 
@@ -148,7 +148,7 @@ def learned_shape(root: Path, category: str) -> cadalign.ShapeModel:
 def unseen_objects(
     root: Path, category: str, count: int, **options: Any
 ) -> Iterator[tuple[int, UnseenObject]]:
-    """So many objects of the split val, spread over all, each with its place among them.
+    """Up to ``count`` objects, evenly chosen from the split val, each with its index.
 
     ``options`` are those of `cadalign evaluate unseen`.
     """
@@ -163,19 +163,19 @@ def unseen_objects(
 # Clocks -------------------------------------------------------------------------------------------
 
 
-def clocked(call: Callable[[], T]) -> tuple[float, float, T]:
-    """Wall clock and processor time of a call, of all its threads [s], and what it returns."""
+def clock(call: Callable[[], T]) -> tuple[float, float, T]:
+    """Wall clock and processor time of a call [s], and its value."""
     wall, busy = time.perf_counter(), time.process_time()
     found = call()
     return time.perf_counter() - wall, time.process_time() - busy, found
 
 
 def seconds(call: Callable[[], object]) -> float:
-    """Wall clock time of a call."""
-    return clocked(call)[0]
+    """Wall clock time of a call [s]."""
+    return clock(call)[0]
 
 
-def used_by(command: Sequence[str], **environment: str) -> tuple[float, float]:
+def measure_command(command: Sequence[str], **environment: str) -> tuple[float, float]:
     """Run a command that keeps byte code; its time [s], and the memory of its largest process [MB].
 
     Some of its rows may fail.

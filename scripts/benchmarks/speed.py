@@ -1,4 +1,4 @@
-"""Times of solvers over OpenCV's, and of first calls."""
+"""Times of solvers relative to OpenCV, and of first calls."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ pixels = camera.project(points + [0.0, 0.0, 2.0])
 """
 _FIRST_CALLS = {
     "first fit": _SETUP + "fit(points, pixels, camera)",
-    "first robust fit, after it": _SETUP + "fit(points, pixels, camera, ransac=RansacOptions())",
+    "first RANSAC fit, after it": _SETUP + "fit(points, pixels, camera, ransac=RansacOptions())",
     "doctor --compile": "from cadalign.cli import main; main(['doctor', '--compile'])",
 }
 
 
 def speed(given: BenchmarkData) -> Tables:
-    """Times over OpenCV's compiled solvers, on the same problems."""
+    """Times relative to OpenCV's compiled solvers, on the same problems."""
     rng = np.random.default_rng(given.seed)
     rows = (row for points in (10, 100, 1024, 4096) for row in _over_opencv(rng, points))
-    yield "Time over OpenCV's, which does not stretch", rows
+    yield "Times relative to OpenCV, which estimates no stretch", rows
 
 
 def _over_opencv(rng: np.random.Generator, points: int) -> Iterator[Row]:
@@ -48,7 +48,7 @@ def _over_opencv(rng: np.random.Generator, points: int) -> Iterator[Row]:
         "fit aepnp": lambda: cadalign.fit(x, uv, camera, method="aepnp"),
         "fit optimal": lambda: cadalign.fit(x, uv, camera),
     }
-    # In turns, so that a slow moment of the machine hits all alike; the first turn does not count.
+    # Alternating, so that load on the machine affects all alike; the first round is warm-up.
     turns = [[_seconds(call) for call in calls.values()] for _ in range(31)]
     medians = dict(zip(calls, np.median(turns[1:], axis=0).tolist(), strict=True))
     for name in (each for each in medians if not each.startswith("cv2")):
@@ -63,14 +63,15 @@ def _seconds(call: Callable[[], object]) -> float:
 
 
 def cold(given: BenchmarkData) -> Tables:
-    """Time of the first calls after installation, when nothing is compiled yet.
+    """Times of the first calls after installation, before anything is compiled.
 
-    Each call runs in a new process; the second one finds what the first has compiled.
+    Each call runs in a new process; the second one uses the compiled code of the first.
     """
     with tempfile.TemporaryDirectory() as folder:
         rows = []
         for name, code in _FIRST_CALLS.items():
             place = Path(folder, "all" if "doctor" in name else "fit")
-            wall, _ = section.used_by([sys.executable, "-c", code], NUMBA_CACHE_DIR=str(place))
+            command = [sys.executable, "-c", code]
+            wall, _ = section.measure_command(command, NUMBA_CACHE_DIR=str(place))
             rows.append({"call": name, "s": wall})
     yield "First calls", rows

@@ -197,7 +197,7 @@ def test_files_of_others_are_not_written_over(tmp_path: Path) -> None:
         folder = tmp_path / name.partition(".")[0]
         folder.mkdir()
         (folder / name).write_text("mine")
-        with pytest.raises(DataError, match=f"holds {name}, which is no run's: there is no run"):
+        with pytest.raises(DataError, match=f"holds {name} but no run.json: not the folder"):
             fitted(source, folder)
         assert (folder / name).read_text() == "mine"
 

@@ -1,4 +1,4 @@
-"""Runs on a Dask cluster: the same bytes, also where a worker dies in the middle."""
+"""Runs on a Dask cluster: equal bytes, also if a worker dies during the run."""
 
 from __future__ import annotations
 

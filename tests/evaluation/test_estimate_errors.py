@@ -1,4 +1,4 @@
-"""Errors of many estimates at once, and the alignment of a model's box to an estimated one."""
+"""Errors of many estimates at once, and alignments of a model's box to an estimated box."""
 
 from __future__ import annotations
 

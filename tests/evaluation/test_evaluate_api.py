@@ -1,4 +1,4 @@
-"""`cadalign.evaluate`: every experiment that the command line has, with the same options."""
+"""`cadalign.evaluate`: all experiments of the command line, with the same options."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import prepared
 from cadalign.evaluation.instances.instance import make_instance
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.options import tuples
+from cadalign.evaluation.options import as_tuples
 from cadalign.evaluation.registry import known_options, spec_named
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.render import Scene
@@ -77,16 +77,16 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         evaluate(tmp_path / "none", "correspondences")
     with pytest.raises(InputError, match="unknown option of keypointnet 'nois_px', did you mean"):
         evaluate(tmp_path, nois_px=1.0)
-    with pytest.raises(InputError, match="root: is not given; keypointnet cannot do without"):
+    with pytest.raises(InputError, match="root: is missing; keypointnet needs it"):
         evaluate(None)
-    with pytest.raises(InputError, match="sweep: is not given"):
+    with pytest.raises(InputError, match="sweep: is missing"):
         evaluate(experiment="simulate")
 
 
 def test_lists_of_options_become_tuples() -> None:
     given = {"a": [1, 2], "b": range(2), "c": "ab", "d": Path("x"), "e": None, "f": 1.5, "g": len}
     kept = {name: given[name] for name in "cdefg"}
-    assert tuples(given) == {"a": (1, 2), "b": (0, 1), **kept}
+    assert as_tuples(given) == {"a": (1, 2), "b": (0, 1), **kept}
 
 
 def test_translation_errors_are_in_diagonals_of_the_model(sample_root: Path) -> None:
@@ -100,7 +100,7 @@ def test_translation_errors_are_in_diagonals_of_the_model(sample_root: Path) -> 
         instance = make_instance(
             some, scene=scene, noise_px=0.5, min_visible=6, seed=0, view_index=0
         )
-        # The object's, as the image shows it, and not the stretched model's.
+        # The diagonal of the original model, not of the stretched one.
         assert instance.diagonal == pytest.approx(size, rel=1e-6)
         fitted = cadalign.fit(instance.points_3d, instance.points_2d, instance.camera)
         errors = alignment_errors(est=fitted.alignment, gt=instance.gt, length=instance.diagonal)

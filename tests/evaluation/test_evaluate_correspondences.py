@@ -22,7 +22,7 @@ from cadalign.evaluation.experiments.correspondences import (
     SPEC,
     CorrespondenceOptions,
     errors_of,
-    spoil,
+    make_problem,
     summarize_shares,
 )
 from cadalign.evaluation.methods import MethodInput
@@ -44,7 +44,7 @@ QUICK = CorrespondenceOptions(ANY, outliers=(0.0, 0.3), draws=2, methods=("epnp"
 
 
 def seen_image(name: str, seed: int) -> Correspondences:
-    """A made image: points about the world's origin, 0.2 px noise."""
+    """A synthetic image: points about the world's origin, 0.2 px of noise."""
     made = simulate_problem(
         np.random.default_rng(seed),
         points=POINTS,
@@ -92,7 +92,7 @@ def write_pickles(folder: Path, names: tuple[str, ...]) -> Path:
 def run(
     root: Path, out: Path, options: CorrespondenceOptions = QUICK, *, workers: int = 0
 ) -> list[dict[str, object]]:
-    """Do a run; its rows."""
+    """Run the experiment and return its rows."""
     do_run(replace(options, path=root), RunFolder(out), workers=workers, dask=None)
     return read_table(RunFolder(out).results).to_pylist()
 
@@ -119,7 +119,7 @@ def test_formats_are_recognised(tmp_path):
 class TestInputs:
     def test_only_the_given_share_is_moved_and_the_rest_is_the_image(self):
         seen = seen_image("a", 1)
-        problem = spoil(seen, 0.35, rng=np.random.default_rng(0))
+        problem = make_problem(seen, 0.35, rng=np.random.default_rng(0))
         wrong = problem.outliers
         assert wrong.sum() == 21
         np.testing.assert_array_equal(problem.points_2d[~wrong], seen.points_2d[~wrong])
@@ -127,7 +127,7 @@ class TestInputs:
 
     def test_the_true_alignment_puts_the_stretched_points_where_they_were(self):
         seen = seen_image("a", 1)
-        problem = spoil(seen, 0.5, rng=np.random.default_rng(0))
+        problem = make_problem(seen, 0.5, rng=np.random.default_rng(0))
         np.testing.assert_allclose(
             problem.alignment.apply(problem.points_3d),
             seen.cam_from_world.apply(seen.points_3d),
@@ -140,7 +140,7 @@ class TestInputs:
 
     @pytest.mark.long
     def test_moved_points_lie_all_over_the_image_and_where_its_lens_model_holds(self):
-        # Its lens model folds back at 230 px from the middle: it holds in half of the image.
+        # The lens model is valid up to 230 px from the centre, in half of the image.
         camera = replace(CAMERA, distortion=(-0.7, 0.0, 0.0, 0.0))
         corner = camera.normalize_where_valid(np.zeros((1, 2)))[1]
         assert not corner[0]
@@ -150,7 +150,7 @@ class TestInputs:
         seen = Correspondences("a", seen.points_3d, points_2d, camera, pose)
         rng = np.random.default_rng(0)
         moved = np.concatenate(
-            [p.points_2d[p.outliers] for p in (spoil(seen, 0.9, rng=rng) for _ in range(20))]
+            [p.points_2d[p.outliers] for p in (make_problem(seen, 0.9, rng=rng) for _ in range(20))]
         )
         assert camera.contains(moved, margin=0.5).all()
         assert camera.normalize_where_valid(moved)[1].all()
@@ -200,7 +200,7 @@ class TestRows:
             assert row["success"] == (row["method"] == "ransac-optimal")
 
     def test_errors_are_counted_as_they_are_described(self):
-        # All points 10 from the camera.
+        # All points are at a distance of 10 from the camera.
         points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=float)
         problem = SimulatedProblem(
             points,

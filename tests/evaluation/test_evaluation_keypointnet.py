@@ -150,7 +150,7 @@ def test_pictures_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
 
 @pytest.mark.slow
 def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Path) -> None:
-    """As the Cramer-Rao bound may state one, at much noise."""
+    """With much noise, the Cramer-Rao bound has such estimates."""
     model = next(iter(KeypointNet(sample_root)))
     scene = load_scene(model)
     instance = make_instance(model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=scene)
@@ -218,5 +218,5 @@ def test_overlays_of_models_without_meshes_are_refused_before_the_run(
     options = ["--render", "overlay", "--workers", "0", "--out", str(out)]
     assert main(["evaluate", "keypointnet", str(annotated), *options]) == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "--render: no mesh of the models is used, so that there is nothing to draw" in said
+    assert "--render: no mesh is used, so there is nothing to draw" in said
     assert not (out / "results.parquet").exists()

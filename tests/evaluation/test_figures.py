@@ -1,4 +1,4 @@
-"""Figures of runs: PNG and PDF of one layout, with letters that publishers take."""
+"""Figures of runs: PNG and PDF with the same layout, and with TrueType fonts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of runs whose files are damaged, missing, or another program's."""
+"""Folders of runs with damaged, missing or foreign files."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(finished: Path, tmp_path: Path) -> Path:
-    """A copy of the sweep that may be changed."""
+    """A copy of the sweep, which tests may change."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 @pytest.fixture(scope="module")
 def halved(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep with one of its two chunks."""
+    """A sweep with one of two chunks finished."""
     path = tmp_path_factory.mktemp("halved") / "run"
 
     def stop(progress: Progress) -> None:
@@ -54,7 +54,7 @@ def halved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def changed(column: str, value: Any, kind: pa.DataType | None = None) -> Change:
-    """Give another column to the table of results."""
+    """Replace a column of the result table."""
 
     def change(run: Path) -> None:
         table = pq.read_table(run / "results.parquet")
@@ -89,29 +89,28 @@ def cut_timings(run: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
 
-_ANEW = "; remove it and start the same run again: what is missing is done anew"
+_ANEW = "; remove it and start the same run again: it is computed again"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (foreign, f"not a table of such a run: there is no column 'points'{_ANEW}"),
-        (without_method, f"not a table of such a run: there is no column 'method'{_ANEW}"),
+        (foreign, f"not a valid table of a run: column 'points' is missing{_ANEW}"),
+        (without_method, f"not a valid table of a run: column 'method' is missing{_ANEW}"),
         (twice, None),
         (
             changed("rotation_error_deg", "large"),
-            "not a table of such a run: the column 'rotation_error_deg' is of the type 'string', "
+            "not a valid table of a run: column 'rotation_error_deg' has the type 'string', "
             f"not 'double'{_ANEW}",
         ),
         (
             changed("method", None),
-            f"not a table of such a run: the column 'method' is of the type 'null', not "
-            f"'string'{_ANEW}",
+            f"not a valid table of a run: column 'method' has the type 'null', not 'string'{_ANEW}",
         ),
         (
             changed("method", None, pa.string()),
-            f"not a table of such a run: the column 'method' has empty cells{_ANEW}",
+            f"not a valid table of a run: column 'method' has empty cells{_ANEW}",
         ),
         (cut_short, None),
     ],
@@ -125,11 +124,11 @@ def test_a_foreign_or_damaged_table_of_results_is_refused(
 ) -> None:
     change(run)
     line = refusal_line(capsys, "report", run)
-    assert line.startswith(f"{run / 'results.parquet'}: not a table ")
+    assert line.startswith(f"{run / 'results.parquet'}: ")
     assert line.endswith(_ANEW)
     if text is not None:
         assert line == f"{run / 'results.parquet'}: {text}"
-    # The advice works.
+    # Following the advice repairs the run.
     (run / "results.parquet").unlink()
     do_run(SWEEP, RunFolder(run), workers=0, dask=None)
     assert (run / "results.parquet").read_bytes() == (finished / "results.parquet").read_bytes()
@@ -155,7 +154,7 @@ def test_an_unfinished_run_with_a_missing_part_is_shown(
     capsys.readouterr()
     (part,) = (run / "parts").iterdir()
     pq.write_table(pa.table({"a": [1]}), part)
-    assert "there is no column 'points'" in refusal_line(capsys, "report", run)
+    assert "column 'points' is missing" in refusal_line(capsys, "report", run)
     # Parts of another, longer run.
     shutil.copy(halved / "parts" / part.name, part)
     shutil.copy(part, run / "parts" / "0000900.parquet")

@@ -1,4 +1,4 @@
-"""Instances without a mesh, methods by name, and the limit as a method."""
+"""Instances without a mesh, methods by name, and the Cramer-Rao bound as a method."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_too_few_keypoints_are_an_error_that_says_how_many() -> None:
         sample_hull_view(KeypointHull(CUBE), KEYPOINT_CAMERA, rng=rng, min_visible=8)
 
 
-def test_views_drawn_together_are_those_drawn_alone() -> None:
+def test_views_drawn_together_equal_views_drawn_alone() -> None:
     hulls = [KeypointHull(cloud(seed, count)) for seed, count in enumerate((14, 5, 9, 30))]
     hulls.append(KeypointHull(CUBE))
 
@@ -121,7 +121,7 @@ def test_without_noise_the_truth_reprojects_exactly_and_is_found() -> None:
     assert (instance.gt.scale[1:] <= 2).all()
 
 
-def test_instances_follow_from_seed_and_names_alone() -> None:
+def test_instances_depend_only_on_seed_and_names() -> None:
     first = instance_of(task(), noise_px=1.0).points_2d
     assert np.array_equal(first, instance_of(task(), noise_px=1.0).points_2d)
     others = (task(), 1), (task("b"), 0), (task(view=1), 0)
@@ -134,7 +134,7 @@ def test_instances_follow_from_seed_and_names_alone() -> None:
 
 
 @pytest.mark.long
-def test_the_limits_errors_have_the_cramer_rao_bound_as_their_covariance() -> None:
+def test_errors_of_the_limit_have_the_cramer_rao_bound_as_covariance() -> None:
     rng = np.random.default_rng(0)
     problem = simulate_problem(rng, points=12, noise_px=0.0)
     gt = problem.alignment

@@ -1,4 +1,4 @@
-"""Sketches: models in few triangles that can still be recognised."""
+"""Mesh previews: simplified models with recognisable shapes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def sphere(rings: int, *, squash: float = 1.0) -> Mesh:
 
 
 def preview_of_mesh(mesh: Mesh, **most: int) -> SimpleNamespace:
-    """Vertices, faces and edges of a mesh's preview, by way of JSON."""
+    """Vertices, faces and edges of a mesh's preview, decoded from JSON."""
     data = json.loads(json.dumps(preview_of(mesh, **most)))
     index = "<u4" if data["wide"] else "<u2"
     counts = np.frombuffer(base64.b64decode(data["vertices"]), "<u2").reshape(-1, 3)
@@ -48,7 +48,7 @@ def preview_of_mesh(mesh: Mesh, **most: int) -> SimpleNamespace:
     )
 
 
-def test_a_light_model_stays_as_it_is_and_its_creases_are_edges() -> None:
+def test_a_small_mesh_is_unchanged_and_its_creases_are_edges() -> None:
     preview = preview_of_mesh(cube())
     assert len(preview.faces) == 12
     assert len(preview.vertices) == 8
@@ -87,7 +87,7 @@ def test_a_mast_thinner_than_a_cell_becomes_a_line() -> None:
     assert (preview.edges == top).any()
 
 
-def test_parts_without_area_do_no_harm() -> None:
+def test_degenerate_faces_are_harmless() -> None:
     point = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     preview = preview_of_mesh(point)
     assert len(preview.faces) == len(preview.edges) == 0

@@ -1,4 +1,4 @@
-"""Methods of one's own, given as functions or as texts ``module:function``."""
+"""User methods, as functions or import paths ``module:function``."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def test_a_function_stands_beside_built_in_methods(given: Any) -> None:
     np.testing.assert_allclose(mine.rotation_error_deg, built_in.rotation_error_deg, rtol=1e-6)
 
 
-def test_a_function_is_told_the_noise_if_it_asks_for_it() -> None:
+def test_a_function_with_a_parameter_sigma_gets_the_noise() -> None:
     sweep = {"sweep": "noise", "values": [1, 2], "runs": 1, "methods": [weighted]}
     table = cadalign.evaluate(experiment="simulate", **sweep, workers=0)
     assert table.status.tolist() == ["failed", "ok"]
 
 
 @pytest.mark.parametrize("bad", BAD, ids=lambda bad: bad.__name__)
-def test_what_a_bad_function_does_is_its_own_failure(bad: Any) -> None:
+def test_a_bad_function_fails_without_stopping_the_run(bad: Any) -> None:
     table = simulate([bad, "aepnp"])
     failed = table[table.method == bad.__name__]
     assert set(failed.status) == {"failed"}
@@ -55,10 +55,10 @@ def test_what_a_bad_function_does_is_its_own_failure(bad: Any) -> None:
     assert good.equals(alone)
 
 
-def test_functions_without_a_name_of_their_own_are_refused() -> None:
-    with pytest.raises(InputError, match="a function that is called <lambda> has no name"):
+def test_functions_without_a_unique_name_are_refused() -> None:
+    with pytest.raises(InputError, match="a function named <lambda> cannot head a column"):
         simulate([lambda a, b, c: None])
-    with pytest.raises(InputError, match="'linear' is the name of more than one"):
+    with pytest.raises(InputError, match="the name 'linear' is already in use"):
         simulate([linear, partial(linear)])
 
 
@@ -67,9 +67,9 @@ def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
 
     def rigid(model: Any, views: Any) -> Any: ...
 
-    with pytest.raises(InputError, match="'shape' is the name of more than one; give the func"):
+    with pytest.raises(InputError, match="the name 'shape' is already in use; rename"):
         cadalign.evaluate(tmp_path, "unseen", methods=[shape])
-    with pytest.raises(InputError, match="'rigid' is the name of more than one; give the func"):
+    with pytest.raises(InputError, match="the name 'rigid' is already in use; rename"):
         PhotosOptions(tmp_path, methods=(rigid,))  # type: ignore[arg-type]
 
 
@@ -91,14 +91,14 @@ def test_worker_processes_import_functions(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_local_function_runs_without_workers_alone() -> None:
+def test_a_local_function_runs_only_without_workers() -> None:
     def local(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
         return linear(points_3d, points_2d, camera)
 
     assert (simulate([local]).status == "ok").all()
     with pytest.raises(InputError, match="workers: a function cannot be sent to worker") as caught:
         simulate([local], workers=1)
-    assert "define it in a module that they can import, or name it module:f" in str(caught.value)
+    assert "define it in an importable module, give module:f" in str(caught.value)
 
 
 _SCRIPT = """
@@ -124,7 +124,7 @@ def test_a_script_needs_no_guard_and_its_functions_are_refused(tmp_path: Path) -
     )
     good, refused = done.stdout.splitlines()
     assert good == "True"
-    assert "(it is defined in a script or a notebook); define it in a module that" in refused
+    assert "(it is defined in a script or a notebook); define it in an importable" in refused
 
 
 def test_a_run_names_its_functions(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Models and cameras that the methods of the evaluation on photos are given."""
+"""Models and cameras in the input of methods on photos."""
 
 from __future__ import annotations
 

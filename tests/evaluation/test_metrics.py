@@ -1,4 +1,4 @@
-"""Metrics of one's own: a function is a column of tables, summaries and pages."""
+"""User metrics: a function is a column of tables, summaries and pages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.methods import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
-from cadalign.evaluation.plots import cumulative
+from cadalign.evaluation.plots import cumulative_plot
 
 
 def simulate(**options: Any) -> Any:
@@ -37,7 +37,7 @@ def test_a_function_is_a_column(given: Any) -> None:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("no_figures")
-def test_it_is_shown_wherever_metrics_are(
+def test_a_function_is_shown_like_other_metrics(
     sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -68,7 +68,7 @@ def test_it_is_shown_wherever_metrics_are(
 
 
 @pytest.mark.long
-def test_every_experiment_with_functions_takes_it(real_data: Path) -> None:
+def test_every_experiment_with_functions_takes_a_metric(real_data: Path) -> None:
     def depth_off(*, est: Any, gt: Any) -> float:
         return depth_error(est=est, gt=gt)
 
@@ -93,7 +93,7 @@ def test_every_experiment_with_functions_takes_it(real_data: Path) -> None:
         assert "linear" in set(table.method)
 
 
-def test_what_a_broken_metric_raises_is_the_reason_of_its_rows() -> None:
+def test_an_error_of_a_metric_is_the_reason_of_its_rows() -> None:
     assert set(simulate(metrics=[broken]).reason) == {"metric broken: RuntimeError: divided"}
 
     def answers(value: Any) -> Any:
@@ -111,7 +111,7 @@ def test_what_a_broken_metric_raises_is_the_reason_of_its_rows() -> None:
         assert answers(value).constant.isna().all()
 
 
-def test_a_run_does_not_go_on_without_its_metrics(tmp_path: Path) -> None:
+def test_a_run_does_not_continue_without_its_metrics(tmp_path: Path) -> None:
     simulate(metrics=[depth_error], out=tmp_path / "run")
     simulate(metrics=["support.solving:depth_error"], out=tmp_path / "run")
     with pytest.raises(DataError, match="another configuration: metric"):
@@ -130,7 +130,7 @@ def test_a_run_does_not_go_on_without_its_metrics(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_is_no_metric_is_refused(function: Any, message: str) -> None:
+def test_invalid_metrics_are_refused(function: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
         FunctionMetric.of(function)
     assert str(caught.value) == message
@@ -144,14 +144,14 @@ def test_names_of_columns_are_refused(sample_root: Path, name: str) -> None:
         return 0.0
 
     function.__name__ = name
-    with pytest.raises(InputError, match=f"metrics: '{name}' is the name of more than one; give"):
+    with pytest.raises(InputError, match=f"metrics: the name '{name}' is already in use; rename"):
         cadalign.evaluate(sample_root, metrics=[function], workers=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["0", "2"])
 @pytest.mark.usefixtures("no_figures")
-def test_what_a_module_prints_is_not_the_output(
+def test_prints_of_a_module_are_not_in_the_output(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
@@ -196,5 +196,5 @@ def test_curves_count_small_errors_and_large_overlaps(
         metric.key: np.array([1.0, 1.0, 3.0, np.nan]),
     }
     run: Any = SimpleNamespace(methods=("mine",), cells=cells)
-    (trace,) = cumulative([run], metric, np.array(places), title="").traces
+    (trace,) = cumulative_plot([run], metric, np.array(places), title="").traces
     assert list(trace.y) == shares

@@ -28,7 +28,7 @@ from cadalign.geometry.symmetry import Symmetry
 
 
 def test_iou_of_boxes_is_taken_over_symmetries():
-    """A cube of 2 moved by 1: 4 of 12. A plank of 2 x 1 x 1 turned by 90 deg: 1 of 3."""
+    """A cube of side 2 moved by 1: 4 / 12. A box of 2 x 1 x 1 rotated by 90 deg: 1 / 3."""
     cube = Box([0, 0, 5], np.eye(3), [2, 2, 2])
     moved = Box([1, 0, 5], np.eye(3), [2, 2, 2])
     assert symmetric_box_iou(est=moved, gt=cube, symmetry=Symmetry.none()) == pytest.approx(1 / 3)
@@ -49,8 +49,8 @@ def test_accuracy_at_pi_6():
     assert rate.of(Group(arrays, arrays)) == 0.5
 
 
-def test_a_new_metric_is_a_cell_of_a_measure() -> None:
-    """A function of one's own is a metric, too: see `test_metrics`."""
+def test_a_measure_adds_a_metric() -> None:
+    """For functions as metrics see `test_metrics`."""
     protocol = Protocol((lambda target, est, gt, box: {"depth": float((est - gt).sum())},))
     target: Any = SimpleNamespace(gt=np.array([0.0, 0.0, 2.0]))
     est, box = target.gt + [0, 0, 0.25], cast(Any, None)
@@ -111,7 +111,7 @@ def test_thresholds(change, is_aligned):
     assert found["scan2cad_aligned"] == is_aligned
 
 
-def test_positions_are_those_of_the_centre():
+def test_translation_errors_are_of_the_centre():
     """Turned by 180 deg about the origin, the point (1, 0, 0) goes to (-1, 0, 0): 2 m."""
     turned, center = placed(yaw=180), np.array([1.0, 0, 0])
     found = scan2cad_errors(est=turned, gt=placed(), center=center)
@@ -148,6 +148,6 @@ def test_errors_are_those_in_any_frame_and_of_any_equal_alignment(
     first, second = pose(est, [scale, 1.1, scale]), pose(gt, [1, 0.9, 1])
     before = scan2cad_errors(est=first, gt=second, **about)
     after = scan2cad_errors(est=moved(first, angle), gt=moved(second, -angle), **about)
-    # The angle of a rotation near 0 is known to the root of rounding.
+    # Angles near 0 have an error of the square root of the rounding error.
     for name in ("rotation_error_deg", "scan2cad_translation_m", "scan2cad_scale"):
         assert after[name] == pytest.approx(before[name], abs=1e-4)

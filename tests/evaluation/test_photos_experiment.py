@@ -30,8 +30,8 @@ from cadalign.evaluation.api import run
 from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions, summarize_objects
 from cadalign.evaluation.instances.photos import PhotoEstimate, PhotoObjects
-from cadalign.evaluation.instances.pictures import cut_out
-from cadalign.evaluation.instances.sighting import Sighting, annotations_of, opened, photo_tasks
+from cadalign.evaluation.instances.pictures import crop_photo
+from cadalign.evaluation.instances.sighting import Sighting, annotations_of, photo_tasks, photos_of
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
@@ -50,18 +50,18 @@ OWN = {
     "Scan2CAD": {"rotation_error_deg", "box_iou", "scan2cad_aligned", "scan2cad_aligned_axes"},
     "PASCAL3D+": {"rotation_error_deg"},
 }
-"""Some metrics of each data set's own."""
+"""Metrics by data set."""
 
 
 @pytest.fixture(autouse=True)
 def _fresh() -> None:
     """Data sets are listed once in a process; tests change them."""
-    opened.cache_clear()
+    photos_of.cache_clear()
 
 
 def done(root: Path, out: Path, **options: Any) -> Run:
     """A finished run."""
-    opened.cache_clear()
+    photos_of.cache_clear()
     run(PhotosOptions(root, **options), RunFolder(out), workers=0, dask=None)
     return SPEC.open(out)
 
@@ -87,7 +87,7 @@ class TestTruth:
 
     @pytest.mark.parametrize("kind", WRITERS)
     def test_is_found_from_the_keypoints_alone(self, tmp_path: Path, kind: str) -> None:
-        """Where models are exact, keypoints too: what methods are given fits the truth."""
+        """With exact models, the keypoints of methods fit the truth."""
         WRITERS[kind](tmp_path / "data")
         method = "stretched" if kind == "Scan2CAD" else "rigid"
         found = done(tmp_path / "data", tmp_path / "run", methods=(method,))
@@ -98,7 +98,7 @@ class TestTruth:
 
 
 def score_poses(dataset: PhotoDataset, poses: dict[tuple[str, str], Alignment]) -> list[Any]:
-    """Rows of a method that gives poses by photo and object, and fails on other objects."""
+    """Rows of a method with given poses by photo and object, which fails on other objects."""
 
     def given(sighting: Sighting) -> PhotoEstimate:
         target = sighting.target
@@ -118,9 +118,9 @@ def summarize_rows(rows: list[Any]) -> list[Summary]:
     return summarize_objects(run)
 
 
-class TestMadeUpErrors:
+class TestSyntheticErrors:
     def test_have_the_scores_of_their_definitions(self, tmp_path: Path) -> None:
-        """A box moved by 30 mm in depth, and one turned by 90 degrees about an axis."""
+        """A box moved by 30 mm in depth, and a box rotated by 90 degrees about an axis."""
         dataset = cadalign.datasets.open(write_scan2cad(tmp_path / "data"))
         truth = {
             (photo.name, found.object_id): found.truth.cam_from_model
@@ -161,7 +161,7 @@ class TestMethods:
         assert error["rigid+mask"] < error["rigid"]
         assert all(row["status"] == "ok" for row in found.results.to_pylist())
 
-    def test_what_an_object_lacks_is_left_out(self, tmp_path: Path) -> None:
+    def test_objects_without_the_evidence_are_left_out(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data", photos=2)
         (root / "mask" / "1.png").unlink()
         methods = ("rigid", "rigid+mask", "rigid+gravity")
@@ -174,7 +174,7 @@ class TestMethods:
         assert [row["reason"] for row in rows[3:]] == [
             "",
             "the object has no mask",
-            "the direction of gravity is not known",
+            "the direction of gravity is unknown",
         ]
 
     def test_few_keypoints_are_left_out(self, tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ class TestRuns:
     @pytest.mark.parametrize("kind", WRITERS)
     def test_every_file_of_annotations_counts(self, tmp_path: Path, kind: str) -> None:
         WRITERS[kind](tmp_path / "data")
-        dataset = opened(tmp_path / "data")
+        dataset = photos_of(tmp_path / "data")
         seen = {annotations_of(dataset, photo_tasks(dataset, None))}
         ends = (".json", ".txt", ".mat")
         files = [path for path in dataset.root.rglob("*") if path.suffix in ends]
@@ -317,7 +317,7 @@ class TestPage:
     [
         (("--methods", "best"), "--methods: unknown method 'best'"),
         (("--methods", "rigid+mask+mask"), "--methods: unknown method 'rigid+mask+mask'"),
-        (("--methods", "truth+mask"), "--methods: truth takes keypoints alone"),
+        (("--methods", "truth+mask"), "--methods: truth uses keypoints only"),
         (("--methods", "shape"), "--methods: unknown method 'shape'"),
     ],
 )
@@ -341,7 +341,7 @@ def test_a_thumb_shows_an_object_with_a_margin_and_has_its_camera() -> None:
     photo = np.zeros((480, 640, 3), np.uint8)
     photo[200:261, 300:401] = 255
     corners = np.array([[300.0, 200.0], [400.0, 260.0]])
-    thumb, near = cut_out(photo, camera, corners)
+    thumb, near = crop_photo(photo, camera, corners)
     assert (near.width, near.height) == thumb.shape[1::-1]
     rows, columns = np.nonzero(thumb[..., 0] > 128)
     assert (columns.max() - columns.min()) / near.width == pytest.approx(1 / 1.4, abs=0.02)

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.long
 
 
 def evaluated(root: Path, out: Path, **options: Any) -> Run:
-    """A finished run; skips where the sample is not there."""
+    """A finished run; skips the test without the sample."""
     if not root.is_dir():
         pytest.skip(f"CADALIGN_DATA has no {root.name}")
     options = {"pictures": 3, **options}

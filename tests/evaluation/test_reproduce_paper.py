@@ -1,4 +1,4 @@
-"""The script that makes the paper's tables and figures anew."""
+"""The script that reproduces the paper's tables and figures."""
 
 from __future__ import annotations
 

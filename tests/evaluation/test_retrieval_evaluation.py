@@ -44,7 +44,7 @@ def make_model(number: int, *, keypoints: int = 12, category: str = "box") -> Li
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Models, the last of which is the first one, stretched."""
+    """Models; the last one is the first one, stretched."""
     models = [make_model(number) for number in range(MODELS - 1)]
     models.append(replace(models[0], model_id=LAST, xyz=models[0].xyz * [1, 1.3, 0.8]))
     path = tmp_path_factory.mktemp("library") / "boxes.cadalign"
@@ -79,7 +79,7 @@ class TestQueries:
             assert ((query.gt.scale[1:] > 0.5) & (query.gt.scale[1:] < 2)).all()
         assert np.std(errors) == pytest.approx(2.0, rel=0.1)
 
-    def test_they_depend_on_seed_and_task_alone(self) -> None:
+    def test_they_depend_only_on_seed_and_task(self) -> None:
         model, task = make_model(3), RetrievalTask("box", "003", 1.0, 7)
         one = observe_model(model, task, seed=0)
         np.testing.assert_array_equal(one.points_2d, observe_model(model, task, seed=0).points_2d)
@@ -99,7 +99,7 @@ class TestQueries:
         few = replace(options, max_models=1)
         assert {task.model_id for task in retrieval_tasks(library, few)} == {"001", "003"}
 
-    def test_models_that_differ_by_stretch_count_as_one(self, library: Path) -> None:
+    def test_models_that_differ_by_a_stretch_count_as_equal(self, library: Path) -> None:
         opened = Library.open(library)
         assert same_shapes(opened, ("box", "000")) == {("box", "000"), ("box", LAST)}
         assert same_shapes(opened, ("box", "005")) == {("box", "005")}
@@ -120,7 +120,7 @@ class TestRows:
         assert np.mean([row["rank"] == 1 for row in rows]) > 0.95
         assert np.median([row["box_iou"] for row in rows]) > 0.7
 
-    def test_left_out_models_and_those_that_count_as_them_are_gone(self, finished) -> None:
+    def test_leave_out_removes_the_model_and_its_equals(self, finished) -> None:
         for row in rows_of(finished, protocol="leave-out"):
             assert row["rank"] is None
             assert row["matched_id"] != row["model_id"]
@@ -150,7 +150,7 @@ class TestRows:
         assert row["box_iou_up_to_scale"] == pytest.approx(up_to_scale)
         assert up_to_scale >= row["box_iou"]
 
-    def test_without_a_view_there_was_nothing_to_ask(self, tmp_path: Path) -> None:
+    def test_models_without_a_view_are_skipped(self, tmp_path: Path) -> None:
         """Keypoints inside the hull are never all visible."""
         xyz = np.vstack(
             [make_model(1).xyz[:8], np.random.default_rng(5).uniform(-0.01, 0.01, (6, 3))]

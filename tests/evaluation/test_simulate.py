@@ -27,7 +27,7 @@ def simulate(sweep: str, **options: Any) -> Any:
     return cadalign.evaluate(experiment="simulate", sweep=sweep, workers=0, **options)
 
 
-def test_outliers_are_as_many_as_said_and_anywhere_in_the_image() -> None:
+def test_outliers_have_the_given_share_and_random_pixels() -> None:
     rng = np.random.default_rng(0)
     problem = simulate_problem(rng, points=200, noise_px=0.0, outlier_share=0.3)
     assert problem.outliers is not None

@@ -1,4 +1,4 @@
-"""Symmetries: what maps a model onto itself is no error, everything else is."""
+"""Symmetries: only rotations that map a model onto itself are no errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def bottle() -> tuple[FloatArray, Symmetries]:
 
 
 def table() -> tuple[FloatArray, Symmetries]:
-    """A rectangular table: two mirrors, so it may be turned by 180 degrees."""
+    """A rectangular table: two mirrors, so a rotation by 180 degrees is a symmetry."""
     corners = SQUARE * [0.5, 1, 0.3]
     xyz = np.concatenate([corners, corners + [0, 0.4, 0]])
     ring = ((0, 1), (1, 2), (2, 3), (3, 0))
@@ -53,7 +53,7 @@ def some_truth(seed: int = 0) -> Alignment:
 
 
 def turned(gt: Alignment, group: Symmetry, rotation: FloatArray) -> Alignment:
-    """The alignment of the object turned about the group's centre."""
+    """The alignment of the object rotated about the group's centre."""
     shift = gt.rotation @ (group.center - rotation @ group.center)
     return Alignment(gt.rotation @ rotation, gt.translation + shift, gt.scale)
 

@@ -1,4 +1,4 @@
-"""An experiment in one file, this one: its run, tables, page, and figures."""
+"""An experiment in this file only: its run, tables, page, and figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Row
 from cadalign.evaluation.summary import medians, summarize
 from cadalign.report import write_report
 
-# --- the experiment: estimate the middle of noisy numbers -------------------------------------
+# --- the experiment: estimate the centre of noisy numbers -------------------------------------
 
 ERROR = Metric("middle_error", "error of the middle", "mm", digits=1, factor=1000.0)
 DRAWS = Metric("draws", "numbers", better=None)
@@ -39,7 +39,7 @@ COLUMNS: Columns = (
 
 @dataclass(frozen=True)
 class MiddleOptions(ExperimentOptions):
-    """Estimate the middle of noisy numbers."""
+    """Estimate the centre of noisy numbers."""
 
     experiment: ClassVar[str] = "middle"
 
@@ -152,7 +152,7 @@ def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--draws: 0 is less than 1" in capsys.readouterr().err
 
 
-def test_random_streams_stay_what_they_are_from_version_to_version() -> None:
+def test_random_streams_do_not_change_between_versions() -> None:
     assert instance_rng(0, "chair", "88382b87").integers(0, 1000, 3).tolist() == [731, 850, 330]
     assert instance_rng(2**40, "").integers(0, 1000, 3).tolist() == [98, 254, 354]
 

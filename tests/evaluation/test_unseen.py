@@ -77,7 +77,7 @@ def column(folder: RunFolder, name: str, method: str) -> np.ndarray:
 
 class TestRecords:
     @pytest.mark.long
-    def test_hold_what_the_metrics_are_of(self, finished: RunFolder) -> None:
+    def test_records_reproduce_the_metrics(self, finished: RunFolder) -> None:
         """Pose, box and warped keypoints of every method."""
         errors = {
             (row["model_id"], row["method"]): (row["keypoint_error"], row["box_iou"])
@@ -143,9 +143,9 @@ class TestLevel:
         for nominal in (0.1, 0.5, 0.68, 0.95):
             assert (levels <= nominal).mean() == pytest.approx(nominal, abs=0.025)
 
-    def test_what_is_held_must_be_right(self) -> None:
+    def test_an_error_without_variance_has_level_1(self) -> None:
         covariance = np.diag([0.0, 1.0, 1.0])
-        # Of two dimensions, a square of 2 log 2 holds one half.
+        # In two dimensions, a squared distance of 2 log 2 has the level one half.
         level = probability_level(np.array([0.0, np.sqrt(2 * np.log(2)), 0.0]), covariance)
         assert level == pytest.approx(0.5)
         assert probability_level(np.array([0.1, 0.0, 0.0]), covariance) == 1.0
@@ -184,7 +184,7 @@ class TestRun:
         assert (inside <= further).all()
 
     @pytest.mark.long
-    def test_a_killed_run_goes_on_to_the_same_bytes(
+    def test_an_interrupted_run_ends_with_the_same_bytes(
         self, root: Path, finished: RunFolder, tmp_path: Path
     ) -> None:
         class Killed(Exception):
@@ -222,7 +222,7 @@ class TestRun:
         table = read_table(folder.results).to_pandas().set_index(["model_id", "method"])
         assert "xyz" in table.reason[f"{TRAIN:03d}", "shape"]
         assert table.status[f"{TRAIN + 1:03d}", "limit"] == "failed"
-        # A keypoint that no model of the category has is left out.
+        # Keypoints without a counterpart in the category are left out.
         assert table.status[f"{TRAIN + 2:03d}", "shape"] == "ok"
         assert (table.status.to_numpy()[6:] == "ok").all()
 

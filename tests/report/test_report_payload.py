@@ -401,7 +401,7 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
     found = report(tmp_path, tmp_path / "run")
     assert found["tables"] is None
     assert found["title"] == "Simulation of noise"
-    assert found["headline"]["group"] == "noise of the keypoints [px]"
+    assert found["headline"]["group"] == "keypoint noise [px]"
     assert [row["category"] for row in found["headline"]["rows"]] == ["1"] * 3 + ["4"] * 3
     plot = found["plots"][0]
     assert (plot["id"], plot["x"]["unit"], plot["y"]["log"]) == ("rotation_error_deg", "px", True)
@@ -430,8 +430,8 @@ BEGUN = '{"experiment": "keypointnet", "tasks": 3, "chunk_size": 1}'
         ({}, "not the folder of a run: it has no run.json; give a folder"),
         ({"run.json": '{"experiment": "brewing"}'}, "no report on a run of 'brewing'; known are k"),
         ({"run.json": "{"}, "not valid JSON"),
-        ({"run.json": BEGUN}, "nothing of the run is finished yet; wait, or start the command"),
-        ({"run.json": BEGUN, "results.parquet": "no table"}, "not a table that can be read"),
+        ({"run.json": BEGUN}, "nothing of the run is finished yet; wait, or start the same"),
+        ({"run.json": BEGUN, "results.parquet": "no table"}, "the table cannot be read"),
     ],
 )
 def test_other_folders_are_refused(

@@ -42,7 +42,7 @@ def unchecked(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
 
 BAD = {
     raising: "RuntimeError: out of luck",
-    leaving: "it called for an exit (4)",
+    leaving: "it called sys.exit (4)",
     of_one: "TypeError: of_one() takes 1 positional argument but 3 were given",
     mapping: "method: it returned dict, no alignment; return a cadalign.Alignment, or the result "
     "of cadalign.fit or cadalign.align",

@@ -1,7 +1,7 @@
-"""The experiment on real correspondences: images with known poses, stretched scenes, outliers.
+"""Experiment on real correspondences: images with known poses, stretched scenes, outliers.
 
-As in the AEPnP paper, the scene is stretched by scales that are drawn anew for every draw, and a
-share of the image points is moved to anywhere in the image. All methods get the same input.
+As in the AEPnP paper, each draw stretches the scene by random scales and moves a share of the image
+points to random pixels. All methods get the same input.
 """
 
 from __future__ import annotations
@@ -52,22 +52,22 @@ _SEARCH = RansacOptions(max_reproj_error=4.0, max_iterations=10_000)
 class CorrespondenceOptions(FunctionOptions):
     """Evaluate methods on real correspondences with outliers.
 
-    For every image, share of outliers and draw, the scene is stretched by factors from 0.5 to 2
-    along y and z, and the share of the image points is moved to anywhere in the image; all methods
-    get the same input. The run's folder gets results.parquet with a row per input and method,
-    summary.csv, figures and report.html. A killed run continues when the same command is
-    started again. Times are best measured with --workers 1.
+    For every image, share of outliers and draw, the scene is stretched by random factors from 0.5
+    to 2 along y and z. The share of the image points is moved to random pixels. All methods get the
+    same input. The run's folder gets results.parquet with a row per input and method, summary.csv,
+    figures and report.html. An interrupted run continues when the same command is started again.
+    Measure times with --workers 1.
     """
 
     experiment = "correspondences"
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a COLMAP model, or of a blind-PnP data set's split."""
+    """Folder of a COLMAP model, or of a split of a blind-PnP data set."""
     _: KW_ONLY
     outliers: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-    """Shares of the image points that are moved, from 0 to less than 1."""
+    """Shares of outliers among the image points, at least 0 and below 1."""
     draws: int = 20
-    """Number of draws of scales and outliers for every image and share."""
+    """Number of draws of scales and outliers per image and share."""
     methods: tuple[str, ...] = (
         "epnp",
         "aepnp-paper",
@@ -75,16 +75,16 @@ class CorrespondenceOptions(FunctionOptions):
         "ransac-aepnp-refined",
         "ransac-optimal",
     )
-    """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, and those that search for inliers:
-    ransac-optimal, ransac-ap4p, and the paper's two steps, ransac-aepnp and ransac-aepnp-refined.
-    The others get all points."""
+    """Methods of `cadalign fit`; optimal-huber, optimal-cauchy (robust losses); ransac-optimal,
+    ransac-ap4p (RANSAC); ransac-aepnp, ransac-aepnp-refined (the paper's RANSAC). Methods without
+    RANSAC get all points, outliers included."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_methods()
         if LIMIT in self.methods:
             raise InputError(
-                "the Cramer-Rao bound needs the noise of the image points, unknown in real images",
+                "the Cramer-Rao bound needs the noise of the image points, unknown for real images",
                 where="methods",
                 fix=f"leave {LIMIT!r} out",
             )
@@ -97,7 +97,7 @@ class CorrespondenceOptions(FunctionOptions):
                 raise InputError(
                     f"{each:g} is not a share of outliers",
                     where="outliers",
-                    fix="give numbers from 0 to less than 1",
+                    fix="give numbers of at least 0 and below 1",
                 )
         self.check_least(draws=1)
 
@@ -114,7 +114,7 @@ ERRORS = (metrics.ROTATION, metrics.TRANSLATION_OF_DISTANCE, metrics.SCALE_Y, me
 
 
 class CorrespondenceTask(NamedTuple):
-    """One draw of scales for one image, with a share of its points to be moved."""
+    """One draw of scales and outliers for one image."""
 
     image: str
     outliers: float
@@ -122,18 +122,18 @@ class CorrespondenceTask(NamedTuple):
 
     @property
     def names(self) -> Row:
-        """The cells that name its rows, but for the method."""
+        """The cells that identify its rows, without the method."""
         return {"image": self.image, "draw": self.draw, "outliers": self.outliers}
 
 
-_opened = lru_cache(maxsize=1)(open_correspondences)
-"""The images of a folder, read once in every process."""
+_images_of = lru_cache(maxsize=1)(open_correspondences)
+"""The images of a folder, read once per process."""
 
 
 def correspondence_tasks(
     images: CorrespondenceSet, options: CorrespondenceOptions
 ) -> list[CorrespondenceTask]:
-    """All draws, image by image and share by share; raises DataError if there are no images."""
+    """All draws of all images and shares; raises DataError if there are no images."""
     names = images.names
     if not names:
         raise DataError("there are no images", where=str(images.root))
@@ -147,32 +147,32 @@ def correspondence_tasks(
 
 
 def _fingerprint(root: Path) -> str:
-    """Hash of the files: a run must not go on with other data."""
+    """Hash of the files, so that a run cannot continue with other data."""
     folder = root if root.is_dir() else root.parent
     return fingerprint_of_files(sorted(path for path in folder.iterdir() if path.is_file()))
 
 
-_SUCCESS_DEG, _SUCCESS_SCALE = 0.5, 0.01  # rotation error below, relative error of scales at most
+_SUCCESS_DEG, _SUCCESS_SCALE = 0.5, 0.01  # upper bounds of rotation and relative scale errors
 _STRETCH = (0.5, 2.0)
 _REDRAWS = 100
 
 
 @dataclass(frozen=True)
-class SpoiledImages(Setting):
-    """Stretched scenes with outliers: the setting of the experiment on real correspondences."""
+class ImageProblems(Setting):
+    """Instances of the experiment: stretched scenes with outliers."""
 
     columns = COLUMNS
 
     options: CorrespondenceOptions
 
-    def failed(self, task: CorrespondenceTask) -> Case:
+    def failed_case(self, task: CorrespondenceTask) -> Case:
         return Case(task.names, {"success": False})
 
     def case(self, task: CorrespondenceTask) -> Case:
-        seen = _opened(self.options.path)[task.image]
+        seen = _images_of(self.options.path)[task.image]
         names = (task.image, str(task.draw), repr(task.outliers))
         rng = instance_rng(self.options.seed, *names)
-        truth = spoil(seen, task.outliers, rng=rng)
+        truth = make_problem(seen, task.outliers, rng=rng)
         ransac = replace(_SEARCH, seed=int(rng.integers(2**31)))
         facts = {"points": len(seen), "success": False}
         return Case(task.names, facts, MethodInput.of_problem(truth, 1.0, ransac=ransac))
@@ -182,7 +182,7 @@ class SpoiledImages(Setting):
 
 
 def errors_of(found: Alignment | Result, given: MethodInput) -> Row:
-    """Errors of an estimate by column."""
+    """Errors of an estimate, by column."""
     assert given.gt is not None
     distance = np.linalg.norm(given.gt.apply(given.points_3d).mean(axis=0))
     errors = alignment_errors(est=pose_of(found), gt=given.gt, length=float(distance))
@@ -191,12 +191,14 @@ def errors_of(found: Alignment | Result, given: MethodInput) -> Row:
     return {"points": len(given.points_3d), **errors, "success": is_success}
 
 
-def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -> SimulatedProblem:
-    """Stretch what an image shows, and move a share of its points to anywhere in the image.
+def make_problem(
+    seen: Correspondences, outliers: float, *, rng: np.random.Generator
+) -> SimulatedProblem:
+    """Stretch the scene of an image and move a share of its points to random pixels.
 
-    The model is the scene with y and z divided by scales between 0.5 and 2, so that the true
-    alignment has the scene's true pose and the scale (1, s_y, s_z). Raises DataError if the lens
-    model is not valid in nearly the whole image.
+    The model is the scene with y and z divided by scales s_y and s_z in [0.5, 2]. The true
+    alignment has the scene's pose and the scale (1, s_y, s_z). Raises DataError if the lens model
+    is invalid in a large part of the image.
     """
     scale = np.array([1.0, *rng.uniform(*_STRETCH, 2)])
     pose = seen.cam_from_world
@@ -215,7 +217,7 @@ def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -
 
 
 def _pixels_anywhere(camera: Camera, count: int, rng: np.random.Generator) -> FloatArray:
-    """Uniform over that part of the image which the lens model can be inverted in, (count, 2)."""
+    """Random pixels (count, 2), uniform where the lens model can be inverted."""
     size = np.array([camera.width, camera.height])
     pixels = rng.uniform(-0.5, size - 0.5, (count, 2))
     for _ in range(_REDRAWS):
@@ -223,7 +225,7 @@ def _pixels_anywhere(camera: Camera, count: int, rng: np.random.Generator) -> Fl
         if valid.all():
             return pixels
         pixels[~valid] = rng.uniform(-0.5, size - 0.5, (int((~valid).sum()), 2))
-    raise DataError("the lens model is valid in a small part of the image only", where="camera")
+    raise DataError("the lens model is valid only in a small part of the image", where="camera")
 
 
 # Summary ------------------------------------------------------------------------------------------
@@ -233,9 +235,9 @@ HEADLINE = (*_COUNTS, metrics.SUCCESS, *ERRORS, metrics.QUERY_MILLISECONDS)
 
 
 def _median(key: str) -> Callable[[Group], float]:
-    """Median of an error, which failures have infinite; NaN where it is a failure's.
+    """Median of an error over all inputs, where a failure is infinite; NaN if infinite.
 
-    An order statistic: to give up on the hard inputs does not improve it.
+    It does not improve when a method refuses hard inputs.
     """
 
     def made(group: Group) -> float:
@@ -254,16 +256,16 @@ _STATISTICS = {
 
 
 def summarize_shares(run: Run) -> list[Summary]:
-    """A summary for every share of outliers and method."""
+    """One summary per share of outliers and method."""
     name = partial(group_name, metrics.OUTLIERS)
     return summarize(run, _STATISTICS, by=("outliers",), name=name)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Success, errors and times against the share of outliers."""
+    """Plots of success, errors and times against the share of outliers."""
     found = [summarize_shares(run) for run in runs]
     notes = {
-        metrics.SUCCESS: "rotation within 0.5 deg and both scales within 1 %",
+        metrics.SUCCESS: "rotation error below 0.5 deg, both scale errors at most 1 %",
         **dict.fromkeys(ERRORS, "medians; failures count as infinite"),
         metrics.QUERY_MILLISECONDS: "medians",
     }
@@ -278,11 +280,11 @@ _CHUNK = 8
 
 def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[CorrespondenceTask]:
     """Plan a run over the images of a model or data set."""
-    _opened.cache_clear()  # a session may have changed its files
-    images = _opened(options.path)
+    _images_of.cache_clear()  # the files may have changed in this session
+    images = _images_of(options.path)
     tasks = correspondence_tasks(images, options)
     more = {"loader": type(images).__name__, "correspondences": _fingerprint(Path(images.root))}
-    benchmark = Benchmark.chosen(SpoiledImages(options), options.methods, metrics=options.metrics)
+    benchmark = Benchmark.of(ImageProblems(options), options.methods, metrics=options.metrics)
     return benchmark.plan(options, tasks, chunk=_CHUNK, **more)
 
 
@@ -297,7 +299,7 @@ SPEC = Spec(
     topic="correspondences",
     subject="draws of real correspondences",
     note=(
-        "Medians; a failure counts as an error beyond all others. Success: rotation within 0.5 deg "
-        "and both scales within 1 %."
+        "Medians; a failure counts as an infinite error. Success: rotation error below 0.5 deg and "
+        "both scale errors at most 1 %."
     ),
 )

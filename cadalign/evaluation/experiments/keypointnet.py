@@ -1,4 +1,4 @@
-"""The experiment on KeypointNet: methods on views of annotated models; and the demonstration."""
+"""Experiment on views of KeypointNet's annotated models, and the demonstration."""
 
 from __future__ import annotations
 
@@ -50,27 +50,27 @@ if TYPE_CHECKING:
 class KeypointNetOptions(ViewOptions):
     """Evaluate methods on views of KeypointNet's models.
 
-    Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
-    stretched by factors from 0.5 to 2 along y and z. The run's folder gets results.parquet with a
-    row per model, view and method, summary.csv, figures, report.html and, if asked for, pictures.
-    A killed run continues when the same command is started again.
+    Each view shows the original model. Methods get its visible keypoints with noise, and the model
+    stretched by random factors from 0.5 to 2 along y and z. The run's folder gets results.parquet
+    with a row per model, view and method, summary.csv, figures, report.html and, with --render
+    overlay, pictures. An interrupted run continues when the same command is started again.
     """
 
     experiment = "keypointnet"
 
     _: KW_ONLY
     split: str | None = None
-    """The dataset's split to take, such as test; all models by default."""
+    """Split of the dataset, such as test; all models by default."""
     min_visible: int = 6
-    """Least number of keypoints that a view must show; of several views, the first."""
+    """Minimum number of visible keypoints per view; random views are drawn until one has them."""
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
-    """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
-    ransac-aepnp, and limit: the Cramer-Rao bound."""
+    """Methods of `cadalign fit`; optimal-huber, optimal-cauchy (robust losses); ransac-optimal,
+    ransac-ap4p, ransac-aepnp, ransac-aepnp-refined (RANSAC); limit (the Cramer-Rao bound)."""
     visibility: Literal["auto", "hull"] = "auto"
-    """Keypoints are seen that rays cast at the mesh reach, where there is one, or, everywhere by
-    hull, by a rule on the hull of the keypoints."""
+    """How visible keypoints are found. auto: by casting rays at the mesh, or as with hull for
+    models without a mesh. hull: from the convex hull of the keypoints."""
     render: Literal["none", "overlay"] = "none"
-    """Draw the first method's result for every model with a mesh, or nothing."""
+    """overlay: draw the first method's result for every model with a mesh; none: no pictures."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,18 +87,18 @@ COLUMNS: Columns = (
     *(("sym_rotation_error_deg", float), ("sym_translation_error", float)),
     *(("sym_box_iou", float), ("translation_error_up_to_scale", float)),
 )
-"""Columns of every run; see docs/formats/runs.md."""
+"""Columns of the result table; see docs/formats/runs.md."""
 
 logger = logging.getLogger("cadalign")
 
 KeypointView = tuple[KeypointTask, Instance]
-"""A view of a model as an instance of the benchmark: its task, and what it shows."""
+"""An instance of the benchmark: a task and the view of its model."""
 
 
 class KeypointTasks(Sequence[KeypointTask]):
-    """All views of all models of a dataset in the order of their names, each made when asked for.
+    """All views of all models of a dataset, sorted by name and made on demand.
 
-    ``options`` are an experiment's, with ``visibility``, ``views_per_model`` and ``max_models``.
+    ``options`` have ``visibility``, ``views_per_model`` and ``max_models``.
     """
 
     def __init__(self, dataset: KeypointNet, options: Any) -> None:
@@ -127,16 +127,16 @@ class KeypointTasks(Sequence[KeypointTask]):
         return first if view == 0 else replace(first, view=view)
 
     def fingerprint(self) -> str:
-        """Hash of the annotations: a run must not go on with others."""
+        """Hash of the annotations, so that a run cannot continue with others."""
         return fingerprint_of_files(self.dataset.files)
 
 
 @dataclass(frozen=True)
 class KeypointViews(Setting):
-    """Views of annotated models: the setting of the KeypointNet experiment.
+    """Instances of the experiment: views of annotated models.
 
-    The first method's alignment of every instance with a mesh is drawn in the folder ``drawn_in``,
-    if one is given; its folders for pictures must exist.
+    If ``drawn_in`` is given, its folders for pictures must exist; they get a picture of the first
+    method's alignment for every instance with a mesh.
     """
 
     columns = COLUMNS
@@ -147,7 +147,7 @@ class KeypointViews(Setting):
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
         return [
-            replace(self.failed(task), error=instance)
+            replace(self.failed_case(task), error=instance)
             if isinstance(instance, Exception)
             else self._case(task, instance)
             for task, instance in zip(tasks, self._instances(tasks), strict=True)
@@ -164,7 +164,7 @@ class KeypointViews(Setting):
         }
         return Case(task.names, facts, (task, instance))
 
-    def failed(self, task: KeypointTask) -> Case:
+    def failed_case(self, task: KeypointTask) -> Case:
         return Case(task.names, {} if task.problem else {"symmetry": str(task.symmetry)})
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
@@ -177,12 +177,12 @@ class KeypointViews(Setting):
             if task.problem:
                 return DataError(task.problem)
             return (
-                next(of_hulls) if task.model is None else attempt(partial(_with_mesh, task, **how))
+                next(of_hulls) if task.model is None else attempt(partial(_mesh_view, task, **how))
             )
 
         return list(map(made, tasks))
 
-    def given(self, view: KeypointView) -> MethodInput:
+    def method_input(self, view: KeypointView) -> MethodInput:
         _, found = view
         keypoints = found.points_3d, found.points_2d, found.camera
         return MethodInput(*keypoints, self.options.sigma, bounds=found.bounds, gt=found.gt)
@@ -204,14 +204,14 @@ class KeypointViews(Setting):
 
 
 def _draw(folder: RunFolder, view: KeypointView, estimate: Any) -> None:
-    # Only here: runs on annotations alone are not to load the renderer.
+    # Imported here: runs without meshes must not load the renderer.
     from cadalign.evaluation.instances.pictures import draw_instance
 
     task, instance = view
     write_picture(draw_instance, folder, instance, estimate, *task.names.values())
 
 
-def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
+def _mesh_view(task: KeypointTask, **how: Any) -> Instance:
     assert task.model is not None
     return make_instance(task.model, scene=scene_of(task.model), view_index=task.view, **how)
 
@@ -219,9 +219,9 @@ def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
 def keypointnet_benchmark(
     options: KeypointNetOptions, drawn_in: RunFolder | None = None
 ) -> Benchmark:
-    """The methods of the options on views of models."""
+    """The benchmark of the chosen methods on views of models."""
     setting = KeypointViews(options, drawn_in)
-    found = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
+    found = Benchmark.of(setting, options.methods, metrics=options.metrics)
     batched = frozenset(each.name for each in found.methods if not each.has_statistics)
     return replace(found, batched=batched)
 
@@ -232,12 +232,12 @@ TABLE = (
     *(metrics.KEYPOINTS, metrics.ROTATION, metrics.TRANSLATION),
     *(metrics.SCALE_Y, metrics.SCALE_Z, metrics.BOX_IOU),
 )
-"""Columns of the plain medians."""
+"""Columns of medians, not symmetry-aware."""
 _COUNTS = (metrics.INSTANCES, metrics.FAILED, metrics.SKIPPED)
 
 
 def _is_success(solved: Cells) -> BoolArray:
-    """Mask (n,) of rows within 5 degrees and 5 %, symmetry-aware."""
+    """Mask (n,) of rows within 5 degrees and 5 %, up to the model's symmetry."""
     within: BoolArray = solved["sym_rotation_error_deg"].astype(float) <= 5.0
     for key in ("sym_translation_error", "scale_y_error", "scale_z_error"):
         within &= solved[key].astype(float) <= 0.05
@@ -252,7 +252,7 @@ _STATISTICS = {
 
 
 def summarize_views(run: Run) -> list[Summary]:
-    """A summary for every category and method; the errors over those of the bound besides."""
+    """One summary per category and method, with the ratio of the rotation error to the bound's."""
     found = summarize(run, _STATISTICS)
     key = metrics.ROTATION.key
     bounds = {each.group: each[key] for each in found if each.method == LIMIT}
@@ -270,8 +270,8 @@ _CURVES = (
 )
 
 
-# A chunk is three files: with few instances in each, large runs spend their time on files.
-_CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK, _LARGE = 64, 8, 256, 5_000  # the last in views
+# Every chunk is written to files, so small chunks slow large runs. The last number is in views.
+_CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK, _LARGE = 64, 8, 256, 5_000
 
 
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
@@ -283,9 +283,9 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     drawn = options.render == "overlay"
     if drawn and (options.visibility == "hull" or not dataset.subset(with_mesh=True).ids()):
         raise InputError(
-            "no mesh of the models is used, so that there is nothing to draw",
+            "no mesh is used, so there is nothing to draw",
             where="render",
-            fix="name ShapeNet's folder by shapenet, leave out visibility hull, or draw nothing",
+            fix="give ShapeNet's folder (shapenet), leave out visibility hull, or render none",
         )
     benchmark = keypointnet_benchmark(options, folder.made_for_pictures() if drawn else None)
     chunk = _CHUNK_DRAWN if drawn else _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
@@ -299,23 +299,23 @@ _LEAST_SAMPLE = 12  # models of each category of a sample dataset
 
 @dataclass(frozen=True)
 class DemoOptions(ExperimentOptions):
-    """Align stretched models to pictures of the originals and show the result.
+    """Align stretched models to pictures of the originals and show the results.
 
-    For each model: choose a view, render it, stretch the model by factors from 0.5 to 2 along y
-    and z, add 1 px of noise to its visible keypoints, fit, and draw true (green) and predicted
-    (red) box. Writes results.parquet and index.html.
+    For each model: draw a view, render it, stretch the model by random factors from 0.5 to 2 along
+    y and z, add 1 px of noise to its visible keypoints, fit, and draw the true (green) and the
+    estimated (red) box. Writes results.parquet and index.html.
     """
 
     experiment = "demo"
     command = "demo"
 
     root: Path | None = None
-    """Folder of a dataset in KeypointNet's layout; by default a sample dataset is generated."""
+    """Folder in KeypointNet's layout; a generated sample dataset by default."""
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
+    """Categories to use; all by default."""
     per_category: int = 6
-    """Largest number of models of each category."""
+    """Maximum number of models per category."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -323,12 +323,12 @@ class DemoOptions(ExperimentOptions):
 
     @property
     def default_workers(self) -> int:
-        """A demonstration is over before worker processes have started."""
+        """None: starting worker processes would take longer than the demonstration."""
         return 0
 
 
 def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
-    """Plan one view of the first models with a mesh of every category."""
+    """Plan one view of the first models with a mesh in every category."""
     root = options.root
     if root is None:
         from cadalign.datasets import write_sample_dataset
@@ -341,7 +341,7 @@ def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
         raise DataError(
             "none of the annotated models has a mesh",
             where=str(dataset.root),
-            fix="put the meshes beside the annotations, or name the folder that holds both",
+            fix="put the meshes beside the annotations, or give the folder that holds both",
         )
     views = KeypointNetOptions(
         root, methods=("optimal",), seed=options.seed, max_models=options.per_category
@@ -363,22 +363,23 @@ SPEC = Spec(
     results=COLUMNS,
     summarize=summarize_views,
     console=(*_COUNTS, *TABLE, metrics.SYM_ROTATION, metrics.SUCCESS_5),
-    console_note="t in model diagonals; * rotations that map a model onto itself are no errors",
+    console_note="t in model diagonals; * up to the symmetry of the model",
     metrics=INSTANCE_METRICS,
     kind=lambda run: "views of models",
     topic="alignment",
     subject="views of models",
     about=(
-        "Each picture shows a model as it is; methods get its visible keypoints, with noise, and "
+        "Each picture shows the original model. Methods get its visible keypoints with noise, and "
         "the model stretched by unknown factors along y and z. Green is the truth, red the "
-        "prediction."
+        "estimate."
     ),
     note=(
-        "Medians over the instances that did not fail; the rates count failures, and not "
-        "the instances that were skipped, since no view shows enough of their keypoints. The "
-        "symmetry-aware error (sym.) takes rotations that map a model onto itself for right. A "
-        "rate counts instances whose symmetry-aware rotation, translation in diagonals of the "
-        "model and both scales are that good."
+        "Medians over the instances that did not fail. Rates include failures, but not skipped "
+        "instances, of which no view shows enough keypoints. Symmetry-aware errors (sym.) are "
+        "relative to the nearest pose that looks like the true one. The rate within 5 deg, 5 % "
+        "counts instances with a symmetry-aware rotation error of at most 5 degrees, a "
+        "symmetry-aware translation error of at most 5 % of the model's diagonal, and scale errors "
+        "of at most 5 %."
     ),
 )
 DEMO = replace(SPEC, options=DemoOptions, plan=plan_demo, plots=lambda runs: [])

@@ -1,6 +1,6 @@
-"""The experiment on data sets of photos: options, names of methods, protocols, summary and page.
+"""Experiment on data sets of photos: options, names of methods, protocols, summary and page.
 
-A method's name is a base, and the evidence beside the keypoints, as in ``rigid+mask``.
+A method's name is a base, and further evidence after plus signs, as in ``rigid+mask``.
 """
 
 from __future__ import annotations
@@ -55,30 +55,30 @@ EVIDENCE = (MASK, GRAVITY, IMAGE)
 
 @dataclass(frozen=True)
 class PhotosOptions(FunctionOptions):
-    """Evaluate methods on photos of real objects, by the metrics of their data set.
+    """Evaluate methods on photos of real objects, with the metrics of their data set.
 
-    The folder may hold Scan2CAD, PASCAL3D+ or Pix3D. Keypoints are the annotated ones. The model's
-    width (x) is given, as one image leaves size open. The run's folder gets results.parquet with a
-    row per object and method, summary.csv, figures and report.html. A killed run continues when the
-    same command is started again.
+    The data set is Scan2CAD, PASCAL3D+ or Pix3D. Methods get the annotated keypoints and the true
+    width (x) of the object, as one image does not determine its size. The run's folder gets
+    results.parquet with a row per object and method, summary.csv, figures and report.html. An
+    interrupted run continues when the same command is started again.
     """
 
     experiment = "photos"
 
     root: Annotated[Path, tyro.conf.Positional]
-    """Folder of the data set, in any of the known formats."""
+    """Folder of the data set; its format is detected."""
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
+    """Categories to use; all by default."""
     methods: tuple[str, ...] = BASES
-    """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
-    keypoints that differ from the model's by 4 % of its diagonal); each but epnp also with
-    evidence, as in rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and
-    truth."""
+    """Base methods: epnp; rigid; stretched; prior (stretched, with a prior on the scales); similar
+    (like prior, and the object's keypoints differ from the model's by 4 % of its diagonal); truth.
+    rigid, stretched, prior and similar take further evidence: mask, gravity, image (the photo
+    itself), as in rigid+mask or similar+mask+gravity."""
     max_photos: int | None = None
-    """Number of photos to take, the first ones; all by default."""
+    """Use only the first photos, this many; all by default."""
     pictures: int = 100
-    """Number of photos whose pictures the report shows, the first ones."""
+    """Number of photos with pictures in the report, from the first."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,25 +90,25 @@ class PhotosOptions(FunctionOptions):
 
 
 def parts_of(method: str) -> tuple[str, frozenset[str]]:
-    """The base of a method, and its evidence."""
+    """Split a method's name into its base and its evidence."""
     base, *evidence = method.split("+")
     return base, frozenset(evidence)
 
 
 def _check_method(method: str) -> None:
-    """Check that there is a method of a name, and that EPnP and the truth are given no evidence."""
+    """Raise InputError for an unknown method, or for evidence with epnp or truth."""
     base, evidence = parts_of(method)
     is_known = base in (*BASES, TRUTH) and evidence <= set(EVIDENCE)
     if not is_known or method.count("+") != len(evidence):
         fix = f"known are {', '.join((*BASES, TRUTH))}, with {', '.join(f'+{e}' for e in EVIDENCE)}"
         raise InputError(f"unknown method {quote(method)}", where="methods", fix=fix)
     if evidence and base in (EPNP, TRUTH):
-        fix = "give rigid, stretched, prior or similar the evidence"
-        raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
+        fix = "use rigid, stretched, prior or similar with this evidence"
+        raise InputError(f"{base} uses keypoints only", where="methods", fix=fix)
 
 
 _PROTOCOLS = {
-    # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
+    # Annotated points of scan and model differ by about 5 cm: 8 px in an image 480 px wide.
     Scan2CAD.kind: Protocol(
         (measure_viewpoint, measure_scan2cad, measure_box), sigma_of_width=1 / 60
     ),
@@ -118,7 +118,7 @@ _OTHER = Protocol((measure_viewpoint, measure_box))
 
 
 def protocol_of(kind: str) -> Protocol:
-    """The protocol of a data set's kind; of another one, viewpoint and box."""
+    """The protocol of a kind of data set; errors of viewpoint and box for an unknown kind."""
     return _PROTOCOLS.get(kind, _OTHER)
 
 
@@ -139,12 +139,12 @@ HEADLINE = (
 )
 _CONSOLE = (
     *(*_COUNTS, *(rate.metric for rate in RATES[:2]), *MEDIANS[:2]),
-    *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
+    *(metrics.RMS, metrics.QUERY_MILLISECONDS),
 )
 
 
 def summarize_objects(run: Run) -> list[Summary]:
-    """A summary for every category and method, and for all together."""
+    """One summary per category and method, and per method over all categories."""
     cells = run.cells
     statistics = {
         "keypoints": mean("keypoints"),
@@ -167,9 +167,9 @@ _CHUNK = 8
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.instances.photos import photos_benchmark
-    from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, reopened
+    from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, reload_photos
 
-    dataset = reopened(options.root)
+    dataset = reload_photos(options.root)
     tasks = photo_tasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     return photos_benchmark(options, pictures).plan(
@@ -195,12 +195,12 @@ SPEC = Spec(
     subject="photos",
     metrics=(*MEDIANS, metrics.RMS),
     about=(
-        "Green is the truth, red what a method found: its box, and the model warped to the "
+        "Green is the truth, red the estimate of a method: its box, and the model warped to the "
         "estimated shape."
     ),
     note=(
-        "Medians over the objects that did not fail, and shares of all, of which failures count as "
-        "misses; objects without camera, model or enough keypoints are left out. The model's width "
-        "is the object's, as one image leaves size open."
+        "Medians over the objects that did not fail; shares count failures as misses. Objects "
+        "without camera, model or enough keypoints are left out. Methods get the true width of the "
+        "object, as one image does not determine its size."
     ),
 )

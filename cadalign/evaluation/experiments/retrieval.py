@@ -1,8 +1,8 @@
-"""The experiment on retrieval: views of a library's models, to be found again in it.
+"""Experiment on retrieval: find a library's models from views of them.
 
-Models whose keypoints are the same after a stretch, to within 1 % of their extent and with the same
-set of keypoints, count as the true model. Two protocols: ``leave-in``, where the library holds the
-model, and ``leave-out``, where it and all that count as it are taken out.
+A model counts as equal to the true one if it has the same set of keypoints, and they agree after a
+stretch to within 1 % of their extent. Two protocols: ``leave-in``, where the library holds the true
+model, and ``leave-out``, where the true model and its equals are removed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.summary import (
     Group,
     Summary,
-    known,
+    drop_nan,
     mean_of,
     median,
     medians,
@@ -49,7 +49,7 @@ from cadalign.io.files import made_folder
 from cadalign.metrics import rotation_error
 
 if TYPE_CHECKING:
-    # Only where a run needs them: they load the compiled solvers.
+    # Imported late elsewhere: they load the compiled solvers.
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
     from cadalign.retrieval.library import Library
@@ -57,32 +57,32 @@ if TYPE_CHECKING:
     from cadalign.retrieval.models import LibraryModel, ModelKey
 
 LEAVE_IN, LEAVE_OUT = "leave-in", "leave-out"
-"""Protocols: the library holds the true model, or it doesn't."""
+"""Protocols: the library holds the true model, or does not."""
 
 METHOD = "optimal"
-"""The name of the one method, `cadalign.Library.retrieve`."""
+"""Name of the only method, `cadalign.Library.retrieve`."""
 
 
 @dataclass(frozen=True)
 class RetrievalRunOptions(ModelOptions):
     """Evaluate the retrieval of CAD models.
 
-    Each model is stretched by factors from 0.5 to 2 along y and z and seen from a random view; some
-    of its visible keypoints, with noise, are looked up in a library that holds the model
-    (leave-in), and in one that doesn't (leave-out). The run's folder gets results.parquet with a
-    row per query and protocol, summary.csv, figures and the library. Killed, it goes on where it
-    was when the same command is started again.
+    Each model is stretched by random factors from 0.5 to 2 along y and z and seen from a random
+    view. The query is some of its visible keypoints with noise. It goes to a library that holds the
+    model (leave-in), and to one that does not (leave-out). The run's folder gets results.parquet
+    with a row per query and protocol, summary.csv, figures and the library. An interrupted run
+    continues when the same command is started again.
     """
 
     experiment = "retrieval"
 
     root: Annotated[Path, tyro.conf.Positional]
-    """Folder in KeypointNet's layout, or a library's file."""
+    """Folder in KeypointNet's layout, or the file of a library."""
     _: KW_ONLY
     noise_px: float = 1.0
-    """Standard deviation of the keypoints' noise, in pixels."""
+    """Standard deviation of the keypoint noise [px]."""
     keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
-    """Numbers of visible keypoints that are given."""
+    """Numbers of keypoints per query; each number is evaluated."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -103,14 +103,14 @@ COLUMNS: Columns = (
 )
 
 TOP = 50
-"""Ranks beyond this are one."""
-_SHAPE_SIGMA = 0.02  # of the keypoints of the best model where the right one lacks, of their extent
-_LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
+"""Number of matches per query; ranks beyond it are missing."""
+_SHAPE_SIGMA = 0.02  # of a similar model's keypoints, relative to their extent
+_LEAST_SIGMA = 0.5  # [px]; without noise, similar models would have no likelihood
 
 
 @dataclass(frozen=True)
 class RetrievalTask:
-    """One view of one model, with a level of noise, a number of keypoints, and a protocol."""
+    """One view of one model: noise, number of keypoints, and protocol."""
 
     category: str
     model_id: str
@@ -120,12 +120,12 @@ class RetrievalTask:
 
     @property
     def names(self) -> Row:
-        """The cells that name its rows, but for the method."""
+        """The cells that identify its rows, without the method."""
         return asdict(self)
 
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
-    """Every model with every number of keypoints that it has, model by model."""
+    """Tasks of every model, with every number of keypoints that the model has."""
     names = library.categories
     if options.categories is not None:
         chosen = {require_category(name, names, where="categories") for name in options.categories}
@@ -149,7 +149,7 @@ def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[Retr
 
 @dataclass(frozen=True, eq=False)
 class RetrievalQuery:
-    """View of a stretched model: noisy keypoints [px], and its true pose and stretch."""
+    """A view of a stretched model: noisy keypoints [px], true pose and stretch."""
 
     points_2d: FloatArray
     ids: IntArray
@@ -157,10 +157,10 @@ class RetrievalQuery:
 
 
 def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> RetrievalQuery:
-    """Stretch a model, draw a view of it, and hand over some of its visible keypoints.
+    """Stretch a model, draw a view, and select some of the visible keypoints.
 
-    Everything random follows from the seed and the task. Visibility follows from the
-    keypoints alone; see `cadalign.evaluation.instances.instance`.
+    The query depends only on the seed and the task. Visibility is found from the keypoints' convex
+    hull; see `cadalign.evaluation.instances.instance`.
     """
     rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
@@ -180,7 +180,7 @@ RetrievalInstance = tuple[RetrievalTask, RetrievalQuery]
 
 @dataclass(frozen=True)
 class RetrievalQueries(Setting):
-    """Queries of a library's file, which all workers map into memory: the experiment's setting."""
+    """Instances of the experiment: queries to a library's file, which workers map into memory."""
 
     columns = COLUMNS
 
@@ -188,17 +188,17 @@ class RetrievalQueries(Setting):
     options: RetrievalRunOptions
 
     def case(self, task: RetrievalTask) -> Case:
-        library = opened_library(self.library)
+        library = open_library(self.library)
         model = library[task.category, task.model_id]
-        same_shapes(library, model.key)  # kept at hand: no query's time holds it
+        same_shapes(library, model.key)  # cached, so that no query is timed with it
         query = observe_model(model, task, seed=self.options.seed)
         return Case(task.names, instance=(task, query))
 
     def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
-        """Compare matches with the true model; errors are those of the first match."""
+        """Rank of the true model, and errors of the first match."""
         from cadalign.retrieval.absence import shape_distance
 
-        (task, query), library, first = instance, opened_library(self.library), matches[0]
+        (task, query), library, first = instance, open_library(self.library), matches[0]
         gt = library[task.category, task.model_id]
         alike = same_shapes(library, gt.key)
         gt_box = Box.from_model(gt.bounds, query.gt)
@@ -220,13 +220,13 @@ class RetrievalQueries(Setting):
 
 
 def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:
-    """Retrieval from a library's file."""
+    """The benchmark of retrieval from a library's file."""
     method = Method(METHOD, partial(_retrieve, library=library))
     return Benchmark(RetrievalQueries(library, options), (method,))
 
 
 def _retrieve(instance: RetrievalInstance, *, library: str) -> list[Match]:
-    (task, query), opened = instance, opened_library(library)
+    (task, query), opened = instance, open_library(library)
     leaves_out = task.protocol == LEAVE_OUT
     return opened.retrieve(
         query.points_2d,
@@ -242,8 +242,8 @@ def _retrieve(instance: RetrievalInstance, *, library: str) -> list[Match]:
 
 
 @lru_cache(maxsize=2)
-def opened_library(path: str | Path) -> Library:
-    """The library of a file, read once in every process."""
+def open_library(path: str | Path) -> Library:
+    """Open a library, once per process."""
     from cadalign.retrieval.library import Library
 
     return Library.open(path)
@@ -251,7 +251,7 @@ def opened_library(path: str | Path) -> Library:
 
 @lru_cache(maxsize=64)
 def same_shapes(library: Library, key: ModelKey) -> frozenset[ModelKey]:
-    """The models of a library that count as the given one, itself among them."""
+    """Keys of the library's models that count as equal to a model, itself included."""
     from cadalign.retrieval.absence import SAME_SHAPE, distances
 
     gt = library[key]
@@ -270,8 +270,8 @@ HEADLINE = (
 )
 
 
-def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group], float]:
-    """Mean of a number of the ranks, NaN beyond 50, where the library holds the true model."""
+def _rank_statistic(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group], float]:
+    """Mean of a function of the leave-in ranks, which are NaN beyond `TOP`."""
 
     def made(group: Group) -> float:
         ranked = group.rows["protocol"] == LEAVE_IN
@@ -281,9 +281,9 @@ def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group]
 
 
 _STATISTICS = {
-    "rank_1": _of_ranks(lambda ranks: (ranks == 1).astype(float)),
-    "reciprocal_rank": _of_ranks(lambda ranks: np.nan_to_num(1 / ranks)),
-    "none": lambda group: mean_of(known(group.solved["none_probability"]) > 0.5),
+    "rank_1": _rank_statistic(lambda ranks: (ranks == 1).astype(float)),
+    "reciprocal_rank": _rank_statistic(lambda ranks: np.nan_to_num(1 / ranks)),
+    "none": lambda group: mean_of(drop_nan(group.solved["none_probability"]) > 0.5),
     **medians(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
     "rotation_error_deg": median("rotation_error_deg"),
     "milliseconds": milliseconds,
@@ -291,7 +291,7 @@ _STATISTICS = {
 
 
 def summarize_queries(run: Run) -> list[Summary]:
-    """A summary for every category, protocol and number of keypoints."""
+    """One summary per category, protocol and number of keypoints."""
     return summarize(
         run,
         _STATISTICS,
@@ -304,7 +304,7 @@ _CHUNK = 16
 
 
 def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]:
-    """Plan a run over the models of a library, which the folder gets, named after its hash."""
+    """Plan a run over a library's models; the run's folder gets the library."""
     from cadalign.retrieval.library import Library
 
     if options.root.is_file():
@@ -332,9 +332,10 @@ SPEC = Spec(
     topic="retrieval",
     subject="views of models",
     note=(
-        "Leave-in: the library holds the true model; models whose keypoints are the same after "
-        "stretch count as it. Leave-out: it and these are taken out. Shape distance, box IoU, "
-        "rotation error and time are medians, the first three of the best match. None of "
-        "these: the share of queries whose object is more likely none of the models than one."
+        "Leave-in: the library holds the true model; models with the same keypoints after a "
+        "stretch count as equal to it. Leave-out: the true model and its equals are removed. Shape "
+        "distance, box IoU and rotation error are medians of the best match; time is a median. "
+        "None of these: the share of queries with more than 50 % probability that the object is "
+        "none of the models."
     ),
 )

@@ -1,8 +1,8 @@
-"""The AEPnP paper's simulation: errors of methods while one quantity is varied.
+"""The AEPnP paper's simulation: errors of methods while one quantity varies.
 
 640 x 480 px, f = 150 px, points in [-1, 1)^3, true scales in [0.5, 2]; see
-`cadalign.evaluation.simulation.simulate_problem`. A summary is of one metric, over the
-problems that a method solved at one value.
+`cadalign.evaluation.simulation.simulate_problem`. A summary covers the problems that a method
+solved at one value of the varied quantity.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SweepKind:
-    """The quantity that is varied, a column of the result table, and those that are held."""
+    """A sweep: the varied quantity (a column of the result table) and the constant ones."""
 
     name: str
     column: Literal["noise_px", "points", "outlier_share"]
@@ -77,22 +77,27 @@ SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS)}
 
 @dataclass(frozen=True)
 class SweepOptions(FunctionOptions):
-    """Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF."""
+    """Repeat the AEPnP paper's simulation.
+
+    Random problems are solved while one quantity varies. The run's folder gets results.parquet,
+    summary.csv, report.html, and figures as PNG and PDF.
+    """
 
     experiment = "simulate"
     command = "simulate"
 
     sweep: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP")]
-    """The quantity that is varied: noise, at 1,024 points; points, at 2 px of noise; or outliers,
-    at 100 points and 2 px."""
+    """The varied quantity: noise (with 1,024 points); points (with 2 px of noise); outliers (with
+    100 points and 2 px of noise)."""
     _: KW_ONLY
     methods: tuple[str, ...] | None = None
-    """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
-    ransac-aepnp, and limit: the Cramer-Rao bound. The sweep's own by default."""
+    """Methods of `cadalign fit`; optimal-huber, optimal-cauchy (robust losses); ransac-optimal,
+    ransac-ap4p, ransac-aepnp, ransac-aepnp-refined (RANSAC); limit (the Cramer-Rao bound). The
+    default depends on the sweep."""
     values: tuple[float, ...] | None = None
-    """Values of the quantity that is varied, instead of the sweep's own."""
+    """Values of the varied quantity, instead of the default ones."""
     runs: int | None = None
-    """Problems for each value."""
+    """Number of problems per value."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,18 +112,18 @@ class SweepOptions(FunctionOptions):
 
     @property
     def kind(self) -> SweepKind:
-        """The sweep, with what is given in place of its own settings."""
+        """The sweep with the given options in place of its defaults."""
         given = {name: getattr(self, name) for name in ("methods", "values", "runs")}
         given = {name: value for name, value in given.items() if value is not None}
         return replace(SWEEPS[self.sweep], **given)
 
     @property
     def run_name(self) -> str:
-        """Name of the run's folder, unless another is given."""
+        """Default name of the run's folder."""
         return f"simulate_{self.sweep}"
 
 
-# Quantities that may be varied: the least value, the bound above, a name, and values to give.
+# By quantity: minimum, upper bound (excluded), noun, and advice.
 _RANGES = {
     "points": (4, math.inf, "a number of points", "give 4 or more"),
     "noise_px": (0, math.inf, "a noise level", "give pixels, 0 or more"),
@@ -144,7 +149,7 @@ COLUMNS: Columns = (
 
 
 class SweepTask(NamedTuple):
-    """One random problem by its setting and its number; ``value`` is what the sweep varies."""
+    """One random problem: its settings and number; ``value`` is of the varied quantity."""
 
     value: float
     points: int
@@ -154,7 +159,7 @@ class SweepTask(NamedTuple):
 
     @property
     def names(self) -> Row:
-        """The cells that name its rows, but for the method."""
+        """The cells that identify its rows, without the method."""
         return {name: value for name, value in self._asdict().items() if name != "value"}
 
 
@@ -171,7 +176,7 @@ def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
 
 @dataclass(frozen=True)
 class SweepProblems(Setting):
-    """Random problems: the setting of the simulation."""
+    """Instances of the simulation: random problems."""
 
     columns = COLUMNS
 
@@ -196,13 +201,13 @@ class SweepProblems(Setting):
 
 
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
-    """The methods of a sweep on its problems, in batches."""
+    """The benchmark of a sweep, whose methods solve problems in batches."""
     setting, batched = SweepProblems(kind.name, seed), frozenset(kind.methods)
-    return Benchmark.chosen(setting, kind.methods, metrics=metrics, batched=batched)
+    return Benchmark.of(setting, kind.methods, metrics=metrics, batched=batched)
 
 
-def kind_of(run: Run) -> SweepKind:
-    """The sweep that a run makes, with its own settings."""
+def sweep_of(run: Run) -> SweepKind:
+    """The sweep of a run, with default settings."""
     name = str(run.config.get("sweep"))
     if name not in SWEEPS:
         where = f"{run.folder.config_file}: sweep"
@@ -210,21 +215,21 @@ def kind_of(run: Run) -> SweepKind:
     return SWEEPS[name]
 
 
-def varied(run: Run) -> Metric:
-    """The quantity that a run varies."""
+def varied_quantity(run: Run) -> Metric:
+    """The varied quantity of a run."""
     known = {each.key: each for each in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
-    return known[kind_of(run).column]
+    return known[sweep_of(run).column]
 
 
 def summarize_sweep(run: Run) -> list[Summary]:
-    """Medians of every metric for every value and method, over the problems that are solved."""
-    name = partial(group_name, varied(run))
-    return summarize(run, medians(*ERRORS), by=(kind_of(run).column,), name=name)
+    """Medians of every metric per value and method, over the solved problems."""
+    name = partial(group_name, varied_quantity(run))
+    return summarize(run, medians(*ERRORS), by=(sweep_of(run).column,), name=name)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Errors against the quantity that is varied."""
-    x, found = varied(runs[0]), [summarize_sweep(run) for run in runs]
+    """Plots of errors against the varied quantity."""
+    x, found = varied_quantity(runs[0]), [summarize_sweep(run) for run in runs]
     return [
         plot_against(found, x, metric, place=x.key, note="medians")
         for metric in (*ERRORS, *runs[0].metrics)
@@ -247,9 +252,9 @@ SPEC = Spec(
     columns=(metrics.INSTANCES, metrics.FAILED, *ERRORS),
     results=COLUMNS,
     summarize=summarize_sweep,
-    group=varied,
+    group=varied_quantity,
     plots=plots,
-    kind=lambda run: f"simulation of {kind_of(run).name}",
+    kind=lambda run: f"simulation of {sweep_of(run).name}",
     subject="problems of the AEPnP paper's simulation",
     note="Medians over the problems that did not fail.",
 )

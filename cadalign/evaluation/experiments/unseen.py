@@ -1,4 +1,4 @@
-"""The experiment on unseen objects, which are no stretched copy of any model."""
+"""Experiment on unseen objects, which are not stretched copies of any known model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, fingerprint
 from cadalign.evaluation.summary import (
     Group,
-    known,
+    drop_nan,
     mean,
     mean_of,
     medians,
@@ -43,13 +43,13 @@ METHODS = ("mean-rigid", "mean-stretched", SHAPE, "exact", LIMIT)
 
 @dataclass(frozen=True)
 class UnseenOptions(ViewOptions):
-    """Evaluate alignment to objects that are no stretched copy of any model.
+    """Evaluate alignment to objects that are not stretched copies of any known model.
 
-    Objects of one split of KeypointNet are aligned with what is learned of their category from
-    the models of the other split: the mean shape, or the shape model; and, for comparison, with the
+    Shapes of categories are learned from the models of one split of KeypointNet. Objects of another
+    split are aligned with the mean shape, with the shape model and, for comparison, with the
     object's own model. The run's folder gets results.parquet with a row per object, view and
-    method, summary.csv, figures, report.html and the learned shapes. A killed run continues when
-    the same command is started again.
+    method, summary.csv, figures, report.html and the learned shapes. An interrupted run continues
+    when the same command is started again.
     """
 
     experiment = "unseen"
@@ -57,21 +57,21 @@ class UnseenOptions(ViewOptions):
 
     _: KW_ONLY
     split: str = "val"
-    """Split of the objects."""
+    """Split of the objects to align."""
     train: str = "train"
-    """Split of the models to learn from."""
+    """Split of the models from which shapes are learned."""
     noise_px: float = 2.0
-    """Standard deviation of the keypoints' noise, in pixels."""
+    """Standard deviation of the keypoint noise [px]."""
     keypoints: int | None = None
-    """Number of keypoints that are given, drawn at random; all by default."""
+    """Number of keypoints per view, drawn at random; all by default."""
     methods: tuple[str, ...] = METHODS
-    """mean-rigid, mean-stretched: the category's mean; shape: its shape model; exact: the object's
-    own model, stretched; limit: the Cramer-Rao bound of the latter."""
+    """mean-rigid, mean-stretched: the category's mean shape; shape: its shape model; exact: the
+    object's own model, stretched; limit: the Cramer-Rao bound of exact."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.split == self.train:
-            what, fix = f"both are {self.split!r}", "objects must not be among the models"
+            what, fix = f"both are {self.split!r}", "learn from another split than the objects'"
             raise InputError(what, where="split, train", fix=fix)
         self.check_least(keypoints=1)
         self.check_methods(METHODS)
@@ -101,16 +101,16 @@ HEADLINE = (
 )
 
 
-def _within(level: str, nominal: float) -> Callable[[Group], float]:
-    """Share of the known levels that are at most the nominal one; NaN of none."""
-    return lambda group: mean_of((known(group.solved[level]) <= nominal).astype(float))
+def _coverage_share(level: str, nominal: float) -> Callable[[Group], float]:
+    """Share of the known levels up to the nominal one; NaN if none is known."""
+    return lambda group: mean_of((drop_nan(group.solved[level]) <= nominal).astype(float))
 
 
 _STATISTICS = {
     "keypoints": mean("keypoints"),
     **medians(*_MEDIANS),
     **{
-        f"{name}_in_{percent}": _within(f"{name}_level", percent / 100)
+        f"{name}_in_{percent}": _coverage_share(f"{name}_level", percent / 100)
         for name in ("rotation", "stretch")
         for percent in (68, 95)
     },
@@ -132,7 +132,7 @@ _CURVES = (
 
 @lru_cache(maxsize=32)
 def learned_shape(folder: Path, category: str) -> ShapeModel:
-    """The shape model of a category, read once in every process."""
+    """Open the shape model of a category, once per process."""
     from cadalign.shapes.model import ShapeModel
 
     return ShapeModel.open(folder / f"{category}.shape")
@@ -141,12 +141,11 @@ def learned_shape(folder: Path, category: str) -> ShapeModel:
 def learn(
     dataset: KeypointNet, categories: Sequence[str], *, split: str, folder: RunFolder
 ) -> Path:
-    """Learn shapes from the models of a split, or find in a folder what was learned before.
+    """Learn shapes from the models of a split, unless the run's folder holds them already.
 
-    Boxes are those of the keypoints. The files' folder is named after a hash of the models, so that
-    those of other models are neither used nor overwritten.
-
-    Raises InputError if there is no such split, or a category has too few models in it.
+    Returns the folder of the shape models, which is named after a hash of the models. Boxes enclose
+    the keypoints. Raises InputError if the split does not exist, or a category has too few models
+    in it.
     """
     from cadalign.shapes.model import ShapeModel
 
@@ -171,7 +170,7 @@ _CHUNK = 8
 
 
 def plan(options: UnseenOptions, folder: RunFolder) -> Plan[KeypointTask]:
-    """Plan a run over a split's objects; the folder gets what is learned from the other split."""
+    """Plan a run over a split's objects; the run's folder gets the learned shapes."""
     from cadalign.evaluation.instances.unseen import unseen_benchmark, unseen_tasks
 
     dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
@@ -190,19 +189,20 @@ SPEC = Spec(
     columns=HEADLINE,
     summarize=partial(summarize, statistics=_STATISTICS),
     console=_CONSOLE,
-    console_note="lengths in model diagonals; scaled: about the camera centre",
+    console_note="lengths in model diagonals; scaled: up to a scale about the camera centre",
     plots=partial(cumulative_curves, curves=_CURVES, of="of unseen objects"),
     topic="unseen objects",
-    subject="views of objects that are no stretched copy of any model",
+    subject="views of objects that are not stretched copies of a known model",
     metrics=_MEDIANS,
     about=(
-        "Green is the object with the box of its keypoints, red what a method found: the object "
-        "warped to the estimated keypoints, and their box."
+        "Green is the object with the box of its keypoints, red the estimate of a method: the "
+        "object warped to the estimated keypoints, and their box."
     ),
     note=(
         "Medians over the objects that did not fail; lengths in diagonals of the object. Up to "
-        "scale: the estimate is scaled about the camera centre first, since one image leaves "
-        "an object's size open. Within 68 % and 95 %: how often the truth lies in the regions of "
-        "these probabilities that a method states; the uncertainties are right where the two agree."
+        "scale: the estimate is first scaled about the camera centre, since one image does not "
+        "determine an object's size. Within 68 % and 95 %: the share of truths inside the stated "
+        "regions of these probabilities. Uncertainties are calibrated if share and probability "
+        "agree."
     ),
 )

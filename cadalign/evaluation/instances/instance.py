@@ -1,14 +1,12 @@
 """Test instances of an annotated model: a view, a stretch, noisy visible keypoints, symmetry.
 
-Which keypoints a view shows is found by rays, or without a mesh by a rule: a keypoint counts as
-visible if a face of the keypoints' convex hull next to it faces the camera. Next to it are the
-faces that it lies on, for one inside the hull those nearest to it, with a slack of 1 % of the
-keypoints' extent. Keypoints in one plane, or fewer than 4, all count as visible. The hull has no
-holes and no parts that stand before others, so the rule is kinder to things such as chairs.
+Visible keypoints are found by casting rays at the mesh. Without a mesh, a keypoint counts as
+visible if one of its faces of the keypoints' convex hull faces the camera. Its faces are the
+nearest ones, with a tolerance of 1 % of the keypoints' extent. Keypoints in one plane, or fewer
+than 4, all count as visible. The hull has no holes and no parts that hide others, so more keypoints
+of an object such as a chair count as visible than really are.
 
-An estimate that is off by a rotation that maps the object onto itself shows the same object in the
-same place: that is no error. `cadalign.datasets.keypoints.annotated_symmetry` finds
-these rotations.
+`cadalign.datasets.keypoints.annotated_symmetry` finds the rotations that map a model onto itself.
 """
 
 from __future__ import annotations
@@ -31,14 +29,14 @@ from cadalign.geometry.pixels import perspective
 from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
-    # Workers that look at annotations only are not to carry the renderer's libraries.
+    # Imported late elsewhere: workers without meshes must not load the renderer.
     from cadalign.render import Scene
 
 KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
-"""The camera of the sparse-keypoint experiment."""
+"""The camera of the experiments on keypoints."""
 STRETCH_RANGE = (0.5, 2.0)
 
-# The ranges of `cadalign.render.sample_view`: azimuth, the elevation's sine, share of the image.
+# Ranges of azimuth [rad], sine of the elevation, and filled share of the image, as in sample_view.
 _LOWEST = np.array([-np.pi, 0.0, 0.7])
 _HIGHEST = np.array([np.pi, np.sin(np.radians(60.0)), 0.95])
 _ATTEMPTS = 100
@@ -57,20 +55,20 @@ class KeypointHull:
 
     @cached_property
     def bounds(self) -> FloatArray:
-        """The keypoints' lowest and highest coordinates, (2, 3) float."""
+        """Lowest and highest coordinates, (2, 3) float."""
         return extent(self.xyz)
 
     def visible_from(self, position: FloatArray) -> BoolArray:
-        """Mask (k,) of the keypoints that count as visible from a place (3,) of the model."""
+        """Mask (k,) of the keypoints that count as visible from a position (3,)."""
         if self._faces is None:
             return np.ones(len(self.xyz), dtype=bool)
         faces, beside = self._faces
         facing = faces[:, :3] @ position + faces[:, 3] > 0
-        return np.asarray(beside @ facing)  # of truth values: is any of both
+        return np.asarray(beside @ facing)  # a product of booleans is True if any pair is
 
     @cached_property
     def _faces(self) -> tuple[FloatArray, BoolArray] | None:
-        """Planes (f, 4) of the faces, outward, and a mask (k, f) of those next to each keypoint."""
+        """Outward planes (f, 4) of the faces, and a mask (k, f) of each keypoint's faces."""
         from scipy.spatial import ConvexHull, QhullError
 
         if len(self.xyz) < 4:
@@ -92,11 +90,10 @@ HullView = tuple[Alignment, BoolArray]
 def sample_hull_view(
     hull: KeypointHull, camera: Camera, *, rng: np.random.Generator, min_visible: int
 ) -> HullView:
-    """Draw a view, as `cadalign.render.sample_view` does, in which enough keypoints count as seen.
+    """Draw a view with enough visible keypoints, from `cadalign.render.sample_view`'s distribution.
 
-    The camera has no lens distortion.
-
-    Raises TooFewVisibleError if no view shows enough of the keypoints.
+    The camera must have no lens distortion. Raises TooFewVisibleError if no view shows enough
+    keypoints.
     """
     (found,) = sample_hull_views([hull], camera, rngs=[rng], min_visible=min_visible)
     if isinstance(found, TooFewVisibleError):
@@ -111,7 +108,7 @@ def sample_hull_views(
     rngs: Sequence[np.random.Generator],
     min_visible: int,
 ) -> list[HullView | TooFewVisibleError]:
-    """Draw a view of each hull as `sample_hull_view` does, from its own random stream."""
+    """Draw a view of each hull from its own random stream; see `sample_hull_view`."""
     counts = [len(hull.xyz) for hull in hulls]
     found: dict[int, HullView] = {}
     best = [0] * len(hulls)
@@ -146,8 +143,8 @@ def _framed_poses(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rotations (n, 3, 3), translations (n, 3) and camera positions (n, 3) of framed views.
 
-    ``drawn`` (n, 3) are azimuth, sine of the elevation, and share of the image to fill; ``bounds``
-    (n, 2, 3) those of the models.
+    ``drawn`` (n, 3) are azimuth [rad], sine of the elevation, and filled share of the image.
+    ``bounds`` (n, 2, 3) are the boxes of the models.
     """
     low, high = bounds[:, 0], bounds[:, 1]
     rotations = _upright_rotations(drawn[:, 0], np.arcsin(drawn[:, 1]))
@@ -160,7 +157,7 @@ def _framed_poses(
 
 
 def _upright_rotations(azimuths: FloatArray, elevations: FloatArray) -> FloatArray:
-    """Model to camera (n, 3, 3), the model's y axis up in the image; angles [rad] of `look_at`."""
+    """Rotations (n, 3, 3) from model to camera with y up; angles [rad] as in `look_at`."""
     sin_a, cos_a = np.sin(azimuths), np.cos(azimuths)
     sin_e, cos_e = np.sin(elevations), np.cos(elevations)
     rows = [
@@ -172,11 +169,11 @@ def _upright_rotations(azimuths: FloatArray, elevations: FloatArray) -> FloatArr
 
 
 def _framed_centers(corners: FloatArray, camera: Camera, *, fill: FloatArray) -> FloatArray:
-    """Places (n, 3) in the camera frame of boxes' centres, to fill shares (n,) of the image.
+    """Positions (n, 3) of boxes' centres in the camera frame, to fill shares (n,) of the image.
 
-    ``corners`` (n, 8, 3) are relative to the centres. The corner X of a box at depth d on the ray a
-    through the image's centre lies f |X - a X_z| / (X_z + d) off it; solved for d, for each corner
-    and direction, the largest d keeps all of them inside.
+    ``corners`` (n, 8, 3) are relative to the centres. Let a be the ray through the image's centre.
+    With the box's centre at depth d on it, a corner X projects to f |X - a X_z| / (X_z + d) from
+    the image's centre. This is solved for d; the largest d of all corners and directions is used.
     """
     size = np.array([camera.width, camera.height])
     focal = np.array([camera.fx, camera.fy])
@@ -199,25 +196,25 @@ class KeypointTask:
     model_id: str
     view: int = 0
     hull: KeypointHull = NO_KEYPOINTS
-    """Keypoints (k, 3), and what views without a mesh need to know of them."""
+    """Keypoints (k, 3) and their convex hull."""
     ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     symmetry: Symmetry = NO_SYMMETRY
     model: AnnotatedModel | None = None
-    """The model with its mesh; None where it is evaluated on its keypoints alone."""
-    problem: str = ""  # reason why the model cannot be evaluated; empty otherwise
+    """The model with its mesh; None if it is evaluated on keypoints only."""
+    problem: str = ""  # why the model cannot be evaluated; empty if it can
 
     @property
     def names(self) -> Row:
-        """The cells that name its rows, but for the method."""
+        """The cells that identify its rows, without the method."""
         return {"category": self.category, "model_id": self.model_id, "view": self.view}
 
     @classmethod
     def of_model(
         cls, dataset: KeypointNet, category: str, model_id: str, *, hull: bool
     ) -> KeypointTask:
-        """The first view of a dataset's model, by its ``hull`` alone or with its mesh.
+        """Make the task of a model's first view; ``hull`` ignores the mesh.
 
-        A malformed model gives a task with a problem.
+        The task of a malformed model has a problem.
         """
         try:
             model = dataset[category, model_id]
@@ -235,26 +232,26 @@ class KeypointTask:
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One view of a model, and what a method is given to align.
+    """One view of a model, and the input of methods.
 
-    The image shows the model as it is. The method gets the same model stretched along y and z by
-    factors it does not know, so the true scale is one over them.
+    The image shows the original model. Methods get the model stretched along y and z by unknown
+    factors, so the true scale is their inverse.
     """
 
     camera: Camera
-    cam_from_model: Alignment  # the pose of the model as the image shows it
-    points_3d: FloatArray  # (n, 3), the visible keypoints of the stretched model
-    points_2d: FloatArray  # (n, 2), their noisy observations [px]
+    cam_from_model: Alignment  # pose of the original model
+    points_3d: FloatArray  # (n, 3), visible keypoints of the stretched model
+    points_2d: FloatArray  # (n, 2), noisy observations [px]
     ids: IntArray
     bounds: FloatArray
-    """(2, 3), lowest and highest coordinates of the stretched model; of its keypoints without a
-    mesh."""
-    gt: Alignment  # the truth: pose, and the scale that undoes the stretch
-    visibility: str  # rays or hull, rule by which keypoints count as seen
-    scene: Scene | None  # the model as the image shows it; None without a mesh
+    """(2, 3), lowest and highest coordinates of the stretched model; without a mesh, of its
+    keypoints."""
+    gt: Alignment  # the truth: pose and inverse stretch
+    visibility: str  # "rays" or "hull": how visible keypoints were found
+    scene: Scene | None  # the original model; None without a mesh
     diagonal: float
-    """Diagonal of the bounding box of the model as the image shows it [model units]; without a mesh
-    1, to which KeypointNet's models are normalised."""
+    """Diagonal of the original model's bounding box [model units]; 1 without a mesh, as
+    KeypointNet's models are normalised."""
 
     @cached_property
     def gt_box(self) -> Box:
@@ -272,7 +269,7 @@ def load_scene(model: AnnotatedModel) -> Scene:
 
 
 scene_of = lru_cache(maxsize=1)(load_scene)
-"""The mesh that was read last: views of one model come one after another."""
+"""`load_scene` with the last scene cached, as views of a model follow each other."""
 
 
 def make_instance(
@@ -286,8 +283,8 @@ def make_instance(
 ) -> Instance:
     """Draw a view, a stretch and keypoint noise [px] for an annotated model with a mesh.
 
-    Everything random follows from (seed, category, model id, view index). The scene is the
-    model's, as `load_scene` gives it.
+    The instance depends only on (seed, category, model id, view index). ``scene`` is the model's,
+    from `load_scene`.
     """
     from cadalign.render import sample_view
 
@@ -295,33 +292,33 @@ def make_instance(
     xyz = model.keypoints.xyz
     view = sample_view(scene, xyz, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
     ids = model.keypoints.ids
-    seen = _Seen(view.cam_from_model, xyz[view.visible], ids[view.visible], scene.bounds, rng)
-    (instance,) = _stretched([seen], noise_px=noise_px, scene=scene)
+    seen = _View(view.cam_from_model, xyz[view.visible], ids[view.visible], scene.bounds, rng)
+    (instance,) = _stretch([seen], noise_px=noise_px, scene=scene)
     return instance
 
 
 def make_hull_instances(
     views: Sequence[KeypointTask], *, noise_px: float, min_visible: int, seed: int
 ) -> list[Instance | TooFewVisibleError]:
-    """Draw views, stretches and keypoint noise, as `make_instance`, for models without a mesh.
+    """Draw views, stretches and keypoint noise [px] for models without a mesh.
 
-    Which keypoints are seen, and a model's box, follow from the keypoints alone. An error takes the
-    place of an instance that no view shows enough keypoints of.
+    Visibility and boxes are found from the keypoints. The result is an error for a model without a
+    view of enough keypoints. See `make_instance`.
     """
     rngs = [instance_rng(seed, each.category, each.model_id, str(each.view)) for each in views]
     hulls = [each.hull for each in views]
     sampled = sample_hull_views(hulls, KEYPOINT_CAMERA, rngs=rngs, min_visible=min_visible)
     seen = [
-        _Seen(found[0], each.hull.xyz[found[1]], each.ids[found[1]], each.hull.bounds, rng)
+        _View(found[0], each.hull.xyz[found[1]], each.ids[found[1]], each.hull.bounds, rng)
         for each, rng, found in zip(views, rngs, sampled, strict=True)
         if not isinstance(found, TooFewVisibleError)
     ]
-    instances = iter(_stretched(seen, noise_px=noise_px, scene=None))
+    instances = iter(_stretch(seen, noise_px=noise_px, scene=None))
     return [e if isinstance(e, TooFewVisibleError) else next(instances) for e in sampled]
 
 
-class _Seen(NamedTuple):
-    """The visible keypoints (n, 3) of a model in a view, and the model's bounds (2, 3)."""
+class _View(NamedTuple):
+    """The visible keypoints (n, 3) of a model, and its bounds (2, 3)."""
 
     cam_from_model: Alignment
     xyz: FloatArray
@@ -330,14 +327,14 @@ class _Seen(NamedTuple):
     rng: np.random.Generator
 
 
-def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) -> list[Instance]:
+def _stretch(views: Sequence[_View], *, noise_px: float, scene: Scene | None) -> list[Instance]:
     if not views:
         return []
     low, high = STRETCH_RANGE
     stretches = np.ones((len(views), 3))
     stretches[:, 1:] = low + (high - low) * np.array([view.rng.random(2) for view in views])
     bounds = np.array([view.bounds for view in views])
-    poses = [view.cam_from_model for view in views]  # without a stretch
+    poses = [view.cam_from_model for view in views]  # with scale 1
     in_camera = [
         view.xyz @ pose.rotation.T + pose.translation
         for view, pose in zip(views, poses, strict=True)

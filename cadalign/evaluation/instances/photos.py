@@ -1,4 +1,4 @@
-"""Objects in photos as methods get them, their estimates, errors, records and pictures."""
+"""Objects in photos: methods, estimates, errors, records and pictures."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ from cadalign.evaluation.instances.sighting import (
     PhotoTarget,
     PhotoTask,
     Sighting,
-    opened,
-    sight,
+    make_sighting,
+    photos_of,
     targets_of,
 )
 from cadalign.evaluation.methods import Method, MethodInput
@@ -60,14 +60,14 @@ from cadalign.evaluation.runs.work import LeftOutError, Outcome, Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.mesh import Mesh
 
-# Evidence about the model's outline, which needs a mesh.
+# Evidence about the outline, which needs a mesh.
 _OUTLINED = frozenset({MASK, IMAGE})
 
 # Methods ------------------------------------------------------------------------------------------
 
 
-_UP_SIGMA_DEG = 3.0  # of rigs and phones, and of objects that stand upright
-_SIMILAR_SIGMA = 0.04  # of an object's keypoints from its model's [diagonals]
+_UP_SIGMA_DEG = 3.0  # of phones and rigs, and of upright objects
+_SIMILAR_SIGMA = 0.04  # standard deviation of the object's keypoints from the model's [diagonals]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +75,13 @@ class PhotoEstimate:
     """An estimate of an object."""
 
     alignment: Alignment
-    """Takes the box of the data set's model, in its own unit, to the estimated one."""
-    box: Box  # the object's box in the camera's frame
+    """Maps the box of the data set's model, in its own unit, to the estimated box."""
+    box: Box  # the object's box in the camera frame
     result: Result | None = None  # with shape and covariances
 
 
 def estimate_object(sighting: Sighting, *, method: str) -> PhotoEstimate:
-    """The estimate of a method by name; see `PhotosOptions.methods`.
+    """Estimate an object by a method's name; see `PhotosOptions.methods`.
 
     Raises LeftOutError if the object lacks what the method needs; and CadalignError if there is no
     estimate.
@@ -90,10 +90,10 @@ def estimate_object(sighting: Sighting, *, method: str) -> PhotoEstimate:
     if base == TRUTH:
         gt, box = sighting.target.gt, sighting.target.gt_box
         if gt is None or box is None:
-            raise LeftOutError("the true pose is not known")
+            raise LeftOutError("the true pose is unknown")
         return PhotoEstimate(gt, box)
     if base == EPNP:
-        given = sighting.given
+        given = sighting.input
         found = fit(given.points_3d, given.points_2d, given.camera, method="epnp")
         return estimate_of_model(found.alignment, sighting)
     model = _model(base, sighting, with_mesh=bool(_OUTLINED & evidence))
@@ -113,7 +113,7 @@ def _model(base: str, sighting: Sighting, *, with_mesh: bool) -> Model:
     if with_mesh:
         scene = sighting.target.scene
         if scene is None:
-            raise LeftOutError("the model has no mesh for the mask")
+            raise LeftOutError("the model has no mesh, which the outline needs")
         kind["mesh"] = Mesh(scene.mesh.vertices * width, scene.mesh.faces)
     return Model(
         points_3d=sighting.model.xyz * width,
@@ -133,20 +133,20 @@ def _view(sighting: Sighting, evidence: Collection[str]) -> View:
         given["mask"] = found.read_mask()
     if GRAVITY in evidence:
         if photo.up is None:
-            raise LeftOutError("the direction of gravity is not known")
+            raise LeftOutError("the direction of gravity is unknown")
         given |= {"up": photo.up, "up_sigma_deg": _UP_SIGMA_DEG}
     if IMAGE in evidence:
         if photo.image is None:
-            raise LeftOutError("the image is not there")
+            raise LeftOutError("the photo's file is missing")
         given["image"] = photo.read_image()
-    seen = sighting.given
+    seen = sighting.input
     return View(seen.camera, seen.points_2d, ids=sighting.names, sigma=seen.sigma, **given)
 
 
 def estimate_of_model(
     found: Alignment, sighting: Sighting, result: Result | None = None
 ) -> PhotoEstimate:
-    """The estimate of the data set's model, from that of the model with the object's width."""
+    """Convert an estimate of the model with the object's width to the data set's model."""
     bounds = sighting.bounds * sighting.width if result is None else result.bounds
     box = Box.from_model(bounds, found)
     alignment = Alignment(found.rotation, found.translation, found.scale * sighting.width)
@@ -158,13 +158,13 @@ def estimate_of_model(
 
 @dataclass(frozen=True)
 class PhotoObjects(Setting):
-    """Objects in photos: the setting of the experiment."""
+    """Instances of the experiment: objects in photos."""
 
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 
     options: PhotosOptions
-    drawn_in: RunFolder  # the folder that pictures go to
+    drawn_in: RunFolder  # folder for pictures
 
     def _cases(self, task: PhotoTask) -> list[Case]:
         wanted = self.options.categories
@@ -177,17 +177,17 @@ class PhotoObjects(Setting):
         return found
 
     def _case(self, target: PhotoTarget) -> Case:
-        protocol = protocol_of(opened(self.options.root).kind)
-        sighting = attempt(partial(sight, target, protocol))
+        protocol = protocol_of(photos_of(self.options.root).kind)
+        sighting = attempt(partial(make_sighting, target, protocol))
         if isinstance(sighting, Exception):
             return Case(target.names, error=sighting)
         facts = {"keypoints": len(sighting.names)}
         return Case(target.names, facts, sighting)
 
-    def given(self, sighting: Sighting) -> MethodInput:
-        return sighting.given
+    def method_input(self, sighting: Sighting) -> MethodInput:
+        return sighting.input
 
-    def answered(
+    def estimate_of(
         self, method: Method, sighting: Sighting, answer: Alignment | Result
     ) -> PhotoEstimate:
         if isinstance(answer, Alignment):
@@ -208,41 +208,41 @@ class PhotoObjects(Setting):
             write_picture(draw_sighting, self.drawn_in, sighting, last)
         return record_of(
             outcomes,
-            [_described(each, sighting) for each in estimates],
-            camera=sighting.given.camera,
+            [_describe(each, sighting) for each in estimates],
+            camera=sighting.input.camera,
             gt=sighting.target.gt,
             stretch=np.ones(3),
             bounds=sighting.bounds,
             points_3d=sighting.points_3d,
-            points_2d=sighting.given.points_2d,
+            points_2d=sighting.input.points_2d,
             ids=np.arange(len(sighting.names)),
         )
 
 
 def photos_benchmark(options: PhotosOptions, drawn_in: RunFolder) -> Benchmark:
-    """The methods of the options on objects in photos."""
+    """The benchmark of the chosen methods on objects in photos."""
     own = {
         name: Method(name, partial(estimate_object, method=name))
         for name in options.methods
         if not is_function(name)
     }
     setting = PhotoObjects(options, drawn_in)
-    return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
+    return Benchmark.of(setting, options.methods, own, metrics=options.metrics)
 
 
 def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
-    """Root mean square residual of the given keypoints [px]; None behind the camera."""
+    """Root mean square residual of the keypoints [px]; None if a point is behind the camera."""
     if found.result is not None:
         residuals = found.result.residuals
     else:
         points = found.alignment.apply(sighting.points_3d)
-        residuals = sighting.given.camera.project_where_ahead(points) - sighting.given.points_2d
+        residuals = sighting.input.camera.project_where_ahead(points) - sighting.input.points_2d
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else np.nan
     return rms if np.isfinite(rms) else None
 
 
-def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | Any:
-    """An estimate in terms of the data set's model; the error where there is none."""
+def _describe(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | Any:
+    """Convert an estimate for the record; errors are unchanged."""
     if not isinstance(estimate, PhotoEstimate):
         return estimate
     result, model = estimate.result, sighting.model
@@ -253,23 +253,23 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
         np.arange(len(model)),
         model.xyz,
         model_bounds=sighting.bounds,
-        sigma=sighting.given.sigma,
+        sigma=sighting.input.sigma,
         result=result,
     )
 
 
 def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate) -> None:
-    """Write the pictures of an object in a photo, and the preview of its model, to a run's folder.
+    """Write pictures of an object and the preview of its model to a run's folder.
 
-    The photo is grey where there is none.
+    A missing photo is drawn grey.
     """
-    names, camera, scene = sighting.target.names, sighting.given.camera, sighting.target.scene
+    names, camera, scene = sighting.target.names, sighting.input.camera, sighting.target.scene
     stem = record_stem(names["category"], names["model_id"])
     try:
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
     boxes = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
-    write_pictures(folder, stem, photo, camera, observed=sighting.given.points_2d, **boxes)
+    write_pictures(folder, stem, photo, camera, observed=sighting.input.points_2d, **boxes)
     if scene is not None:
         write_preview(folder.previews / f"{stem}.json", scene.mesh)

@@ -1,4 +1,4 @@
-"""Pictures of instances, with true and predicted boxes, and previews of their models' meshes."""
+"""Pictures of instances with true and estimated boxes, and mesh previews."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from cadalign.render import RaycastRenderer, draw_overlay
 from cadalign.render.canvas import ByteImage
 
 NO_PHOTO = 225
-"""Grey of a photo that is not there."""
+"""Grey level of missing photos."""
 _MOST = 1024  # pixels of a photo's longer side
 _THUMB = (320, 240)
-_MARGIN = 0.2  # of a thumb, around the object
+_MARGIN = 0.2  # around the object, relative to its size
 _QUALITY, _THUMB_QUALITY = 85, 75
-_EFFORT = 2  # of WebP's 6: half the time of 4, files 3 % larger
+_EFFORT = 2  # WebP's method, 0 (fast) to 6 (small)
 
 
 def write_pictures(
@@ -48,17 +48,17 @@ def write_pictures(
 ) -> None:
     """Write the pictures of an instance, named ``stem``, to a run's folder.
 
-    ``pictures`` gets the photo; ``thumbs`` the part around the object and its
-    keypoints ``observed`` (n, 2) [px], with the boxes of truth and estimate.
+    The folder's ``pictures`` gets the photo. ``thumbs`` gets the part around the object and its
+    keypoints ``observed`` (n, 2) [px], with the true and the estimated box.
     """
-    small, near = shown_photo(photo, camera)
+    small, near = shrink_photo(photo, camera)
     box = gt_box or est_box
     corners = np.empty((0, 2)) if box is None else near.project_where_ahead(box.corners)
     points = np.concatenate([rescaled_pixels(observed, near.width / camera.width), corners])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         points = np.array([[0, 0], [near.width, near.height]], dtype=float)
-    crop, crop_camera = cut_out(small, near, points)
+    crop, crop_camera = crop_photo(small, near, points)
     boxes: dict[str, Any] = {"gt_box": gt_box, "est_box": est_box}
     thumb = draw_overlay(crop, crop_camera, axes=False, legend=False, **boxes)
     write_webp(folder.pictures / f"{stem}.webp", small)
@@ -92,8 +92,8 @@ def draw_instance(
         write_preview(preview, instance.scene.mesh)
 
 
-def shown_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
-    """A photo in a size for a page, its longer side at most 1024 pixels, and its camera."""
+def shrink_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
+    """Shrink a photo to at most 1024 pixels on its longer side; returns it and its camera."""
     factor = min(1.0, _MOST / max(camera.width, camera.height))
     size = tuple(max(1, round(factor * length)) for length in (camera.width, camera.height))
     if photo.shape[1::-1] != size:
@@ -101,14 +101,14 @@ def shown_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
     return photo, camera.resized(*size)
 
 
-def cut_out(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteImage, Camera]:
-    """The part of a photo around points (n, 2) [px] as a thumb, and its camera."""
+def crop_photo(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteImage, Camera]:
+    """Crop a photo around points (n, 2) [px] to a thumb; returns it and its camera."""
     limit = np.array([camera.width, camera.height], dtype=float)
     low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
-    across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel
+    across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's per thumb's pixel
     across = min(max(across, 0.1), float((limit / _THUMB).max()))
     left, top = (low + high) / 2 - across * np.array(_THUMB) / 2
-    # A pixel's borders, not its centre, stay in place.
+    # Borders of pixels, not their centres, are aligned.
     warp = np.array([[across, 0, left], [0, across, top]])
     how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
     crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderValue=(NO_PHOTO,) * 3)
@@ -125,7 +125,7 @@ def cut_out(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteI
 
 
 def write_webp(path: Path, image: ByteImage, *, quality: int = _QUALITY) -> None:
-    """Write a picture for a page, whole or not at all."""
+    """Write a picture for a page as WebP, atomically."""
     picture = Image.fromarray(image)
     write_whole(path, lambda unfinished: picture.save(unfinished, quality=quality, method=_EFFORT))
 
@@ -135,18 +135,19 @@ def _renderer() -> RaycastRenderer:
     return RaycastRenderer()
 
 
-_MOST_PARTS = 1500  # triangles and lines of a preview each
-_FINEST = 1 << 15  # cells along the longest side: the steps of 16-bit coordinates
+_MOST_PARTS = 1500  # triangles, and as many lines, in a preview
+_FINEST = 1 << 15  # cells along the longest side, within the range of 16-bit coordinates
 _CREASE_DEG = 30.0
 
 
 def preview_of(
     mesh: Mesh, *, max_faces: int = _MOST_PARTS, max_edges: int = _MOST_PARTS
 ) -> dict[str, Any]:
-    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid.
+    """Simplify a mesh by grid clustering, to a maximum number of triangles and of lines.
 
-    Returns arrays for JSON as base64, little-endian: vertex = lo + step * uint16. ``edges`` are
-    pairs of vertices for a wireframe: parts too thin for triangles, creases and borders.
+    Returns fields for JSON, with arrays as little-endian base64: vertex = lo + step * uint16.
+    ``edges`` are pairs of vertices for a wireframe: parts too thin for triangles, creases and
+    borders.
     """
     small = cluster(mesh, cells=_FINEST)
     if len(small.faces) > max_faces:

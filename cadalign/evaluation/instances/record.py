@@ -1,6 +1,6 @@
-"""Instance records: camera, keypoints, truth and estimates, enough to draw an instance.
+"""Instance records: camera, keypoints, truth and estimates of an instance, for drawing it.
 
-A record is a row of ``records.parquet``, whose form docs/formats/runs.md describes.
+A record is a row of ``records.parquet``; see docs/formats/runs.md.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from cadalign.geometry.alignment import Alignment, extent
 from cadalign.geometry.camera import Camera
 
 RECORD_COLUMNS: Columns = (("category", str), ("model_id", str), ("view", int), ("exhibit", str))
-# More than any picture can show, and little enough to store.
+# Precise enough for pictures, and small to store.
 _MODEL_DIGITS = 9
 _PIXEL_DIGITS = 4
 _WARP_DIGITS = 6
 _LONGEST_NAME = 200  # bytes
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
-# Several times as fast as the standard library's; numbers that are not finite become null.
+# Faster than the standard library; numbers that are not finite become null.
 _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 _LEAST_SCALE = 1e-6
@@ -36,22 +36,21 @@ _LEAST_SCALE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class AlignedShape:
-    """The estimate of an object's own shape, for an instance's record.
+    """An estimate of pose and shape, for an instance's record.
 
-    ``source`` (k, 3) are keypoints of the given model, ``target`` (k, 3) their places on the
-    estimated object, in the model's coordinates: the alignment takes both into the camera's.
+    ``source`` (k, 3) are keypoints of the model; ``target`` (k, 3) are the estimated keypoints of
+    the object. Both are in the model frame, from which the alignment maps to the camera frame.
     """
 
-    alignment: Alignment  # takes the box of the model that methods are given to the estimated one
+    alignment: Alignment  # maps the model's box to the estimated box
     source: FloatArray
     target: FloatArray
     sigma: float  # standard deviation of the keypoints [px]
-    result: Result | None  # None for a method that states no uncertainties
+    result: Result | None  # None for methods without uncertainties
 
 
 Estimate = Result | AlignedShape | Alignment | Exception
-"""A fit, the estimate of the object's own shape, the alignment of a method that returns no more, or
-the reason why there is none."""
+"""A result, an estimate of pose and shape, an alignment, or the error of a method."""
 
 
 def aligned_shape(
@@ -64,11 +63,11 @@ def aligned_shape(
     result: Result | None,
     spans_points: bool = False,
 ) -> AlignedShape:
-    """An estimate of pose and shape in terms of a model, with what remains of the shape as a warp.
+    """Express an estimate of pose and shape as an alignment of a model and a warp.
 
-    ``found`` is a result or another estimate with an ``alignment``, ``points_3d`` and ``bounds``;
-    ``rows`` are those of the estimated keypoints that the model has at the places ``source``. The
-    estimated box is theirs where it ``spans_points``.
+    ``found`` has an ``alignment``, ``points_3d`` and ``bounds``. Its keypoints ``rows`` correspond
+    to the model's keypoints ``source``. With ``spans_points``, the estimated box is the box of
+    these keypoints.
     """
     points = found.points_3d[rows]
     bounds = extent(points) if spans_points else found.bounds
@@ -80,7 +79,7 @@ def aligned_shape(
 def box_alignment(
     alignment: Alignment, bounds: FloatArray, *, model_bounds: FloatArray
 ) -> Alignment:
-    """The alignment that takes a model's box to where another one takes given bounds (2, 3)."""
+    """The alignment that maps a model's box to where ``alignment`` maps ``bounds`` (2, 3)."""
     lengths, given = np.ptp(bounds, axis=0) * alignment.scale, np.ptp(model_bounds, axis=0)
     scale = np.maximum(lengths, _LEAST_SCALE) / np.where(given > 0, given, 1.0)
     scale = np.where(given > 0, scale, 1.0)
@@ -101,42 +100,42 @@ def record_of(
     ids: IntArray,
     stretch: FloatArray | None = None,
 ) -> str:
-    """The record of an instance as JSON, from each method's outcome and its estimate.
+    """Format the record of an instance as JSON, with the outcome and estimate of each method.
 
-    ``stretch`` (3,) is that of the model, by default what the true scale undoes.
+    ``stretch`` (3,) is the stretch of the model, by default the inverse of the true scale.
     """
     if stretch is None:
         stretch = np.ones(3) if gt is None else 1 / gt.scale
     record = {
         "camera": {name: getattr(camera, name) for name in _CAMERA},
         "gt": None if gt is None else _pose(gt),
-        "stretch": _rounded(stretch),
-        "bounds": _rounded(bounds),
-        "points_3d": _rounded(points_3d),
-        "points_2d": _rounded(points_2d, _PIXEL_DIGITS),
+        "stretch": _round(stretch),
+        "bounds": _round(bounds),
+        "points_3d": _round(points_3d),
+        "points_2d": _round(points_2d, _PIXEL_DIGITS),
         "semantic_ids": ids.tolist(),
-        "estimates": list(map(_described, outcomes, estimates)),
+        "estimates": list(map(_describe, outcomes, estimates)),
     }
     return _ENCODER.encode(record).decode()
 
 
 def record_stem(category: str, model_id: str, view: int = 0) -> str:
-    """The name, without an ending, of the files with an instance's pictures."""
+    """The file name of an instance's pictures, without suffix."""
     name = f"{category}_{model_id}"
     stem = name.replace("/", "_").replace("\0", "_")
     coded = name.encode("utf-8", "replace")
-    # Not a possible name of a file, or the same as that of another model's view.
+    # Invalid or too long as a file name, or ambiguous with a view of another model.
     if stem != name or len(coded) > _LONGEST_NAME or _LIKE_A_VIEW.search(name):
         stem = f"{stem[:40]}-{hashlib.sha256(coded).hexdigest()[:12]}"
     return stem if view == 0 else f"{stem}_{view}"
 
 
-def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
+def _describe(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
     method = outcome.names["method"]
     if not outcome.is_ok or isinstance(estimate, Exception):
         return {"method": method, "reason": outcome.reason}
     result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
-    # The residual of the result table, or else the estimate's own.
+    # Prefer the residual of the result table.
     rms = outcome.values.get("rms_px", None if result is None else result.rms)
     return {
         "method": method,
@@ -154,19 +153,19 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
 
 
 def _pose(alignment: Alignment) -> dict[str, Any]:
-    # Rounded in one go: this is done for every estimate of every instance.
+    # One call for speed, as there are many estimates.
     packed = [alignment.rotation.ravel(), alignment.translation, alignment.scale]
-    values = _rounded(np.concatenate(packed))
+    values = _round(np.concatenate(packed))
     return {"rotation": values[:9], "translation": values[9:12], "scale": values[12:]}
 
 
 def _warp(estimate: object) -> dict[str, Any]:
-    """The deformation of an estimated shape; nothing for the given model."""
+    """The warp of an estimated shape; empty for other estimates."""
     if not isinstance(estimate, AlignedShape):
         return {}
     ends = {"from": estimate.source, "to": estimate.target}
-    return {"warp": {name: _rounded(points, _WARP_DIGITS) for name, points in ends.items()}}
+    return {"warp": {name: _round(points, _WARP_DIGITS) for name, points in ends.items()}}
 
 
-def _rounded(values: FloatArray, digits: int = _MODEL_DIGITS) -> Any:
+def _round(values: FloatArray, digits: int = _MODEL_DIGITS) -> Any:
     return values.round(digits).tolist()

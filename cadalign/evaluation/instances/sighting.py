@@ -1,4 +1,4 @@
-"""Photos as tasks, their objects with truth and CAD models, and what methods are given of them."""
+"""Photos as tasks, their objects with truth and CAD models, and the input of methods."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ from cadalign.render.scene import Scene
 
 _KEPT = 16
 _LEAST_KEYPOINTS = 6
-_SIGMA_OF_SIDE = 1 / 64  # of the rectangle's longer side: networks' heatmaps have 64 cells
-_LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
-_FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
+_SIGMA_OF_SIDE = 1 / 64  # relative to the longer side: heatmaps of networks have 64 cells
+_LEAST_PX = 0.5  # minimum standard deviation of keypoints
+_FOCAL_PRIOR = 0.2  # stretch_sigma while the focal length is estimated
 
 
 @dataclass(frozen=True)
 class PhotoTask:
-    """One photo of a data set, by its number."""
+    """One photo of a data set."""
 
-    index: int  # its number in the data set; -1 of a record that is no photo
+    index: int  # index in the data set; -1 for a record that cannot be read
     name: str
-    problem: str = ""  # reason why the record cannot be read at all; empty otherwise
+    problem: str = ""  # why the record cannot be read; empty if it can
 
     @property
     def names(self) -> Row:
-        """The cells that name the rows of the whole record, but for the method."""
+        """The cells that identify rows of the whole photo, without the method."""
         return {"category": UNREADABLE, "model_id": self.name, "view": 0}
 
 
 def photo_tasks(dataset: PhotoDataset, max_photos: int | None) -> list[PhotoTask]:
-    """The photos of a data set, then the records that its listing could not read."""
+    """Tasks of a data set's photos, followed by its unreadable records."""
     tasks = [PhotoTask(index, name) for index, name in enumerate(dataset.names[:max_photos])]
     bad = dataset.problems.items() if max_photos is None else ()
     tasks += [PhotoTask(-1, name, str(error)) for name, error in bad]
@@ -67,23 +67,23 @@ def photo_tasks(dataset: PhotoDataset, max_photos: int | None) -> list[PhotoTask
 
 
 def annotations_of(dataset: PhotoDataset, tasks: Sequence[PhotoTask]) -> str:
-    """Hash of the photos' names and annotations: a run must not go on with others."""
+    """Hash of photos' names and annotations, so that a run cannot continue with others."""
     return fingerprint(repr(tasks), fingerprint_of_files(dataset.annotation_files()))
 
 
-opened = lru_cache(maxsize=1)(open_photos)
-"""The data set of a folder, listed once in every process."""
+photos_of = lru_cache(maxsize=1)(open_photos)
+"""The data set of a folder, listed once per process."""
 
 
-def reopened(root: Path) -> PhotoDataset:
-    """`opened`, listed anew: a session may have changed its files."""
-    opened.cache_clear()
-    return opened(root)
+def reload_photos(root: Path) -> PhotoDataset:
+    """List a data set again, as its files may have changed in this session."""
+    photos_of.cache_clear()
+    return photos_of(root)
 
 
 @dataclass(frozen=True)
 class _Cad:
-    """A CAD model by its name, for which its mesh is kept."""
+    """A CAD model, which its name identifies as a key of the mesh cache."""
 
     root: str
     model_id: str
@@ -101,22 +101,22 @@ def _scene(cad: _Cad) -> Scene | None:
 
 @dataclass(frozen=True, eq=False)
 class PhotoTarget:
-    """An object of a photo with its truth, as metrics need it."""
+    """An object in a photo with its truth."""
 
     photo: Photo
     found: PhotoObject
     root: str  # the data set's folder
-    is_shown: bool = False  # its pictures are drawn
+    is_shown: bool = False  # whether pictures are drawn
 
     @property
     def scene(self) -> Scene | None:
-        """The mesh of the CAD model; None if there is none that can be read."""
+        """The CAD model's mesh; None if it is missing or cannot be read."""
         model = self.found.model
         return None if model is None else _scene(_Cad(self.root, model.model_id, model))
 
     @property
     def bounds(self) -> FloatArray | None:
-        """The box (2, 3) of the CAD model: the annotation's, the mesh's or its keypoints'."""
+        """The CAD model's box (2, 3): from the annotation, the mesh, or the keypoints."""
         model = self.found.model
         if model is None or model.bounds is not None:
             return None if model is None else np.asarray(model.bounds)
@@ -140,10 +140,11 @@ class PhotoTarget:
 
     @property
     def camera(self) -> Camera | None:
-        """The photo's camera, or that of the annotation's convention at the object's rectangle.
+        """The camera as methods get it; None if unknown.
 
-        Where the focal length is unknown, the true pose is of a camera whose principal point is at
-        the object; methods get the middle of its rectangle instead.
+        If the focal length is unknown, the annotated pose refers to a camera with its principal
+        point at the object. Methods then get the annotated focal length, and the centre of the
+        object's rectangle as principal point.
         """
         camera, annotated = self.photo.camera, self.found.truth.camera
         if camera is None or camera.focal_known or annotated is None:
@@ -154,17 +155,17 @@ class PhotoTarget:
 
     @property
     def names(self) -> Row:
-        """The cells that name its rows, but for the method."""
+        """The cells that identify its rows, without the method."""
         found = self.found
         model_id = f"{self.photo.name}/{found.object_id}"
         return {"category": found.category, "model_id": model_id, "view": 0}
 
 
 def targets_of(task: PhotoTask, root: Path, *, pictures: int) -> list[PhotoTarget | Case]:
-    """The objects of a photo, and cases without an instance for what cannot be read."""
+    """Objects of a photo, and cases without an instance for unreadable parts."""
     if task.problem:
         return [Case(task.names, error=DataError(task.problem))]
-    dataset = opened(root)
+    dataset = photos_of(root)
     try:
         photo = dataset[task.index]
     except DataError as error:
@@ -181,47 +182,47 @@ def targets_of(task: PhotoTask, root: Path, *, pictures: int) -> list[PhotoTarge
 def rectangle_of(found: PhotoObject) -> FloatArray:
     """The object's rectangle [px]."""
     if found.bbox is None:
-        raise LeftOutError("the object's place in the photo is not known")
+        raise LeftOutError("the object's rectangle in the photo is unknown")
     return found.bbox
 
 
-# What methods are given ---------------------------------------------------------------------------
+# Input of methods ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """The keypoints of an object that methods are given."""
+    """An object in a photo as an instance: its keypoints and the input of methods."""
 
     target: PhotoTarget
-    names: tuple[str, ...]  # (n,), the given keypoints
-    points_3d: FloatArray  # (n, 3), their places on the model, in its own unit
+    names: tuple[str, ...]  # (n,), names of the keypoints in the photo
+    points_3d: FloatArray  # (n, 3), their positions on the model, in its own unit
     model: NamedPoints  # all keypoints of the model, in its own unit
     bounds: FloatArray  # (2, 3), the model's box, in its own unit
-    width: float  # factor of the model's size that gives it the object's width
+    width: float  # factor that scales the model to the object's width
     protocol: Protocol  # of the data set
-    given: MethodInput  # of the model with the object's width
+    input: MethodInput  # with the model scaled to the object's width
 
 
-def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
-    """Collect what methods are given of an object.
+def make_sighting(target: PhotoTarget, protocol: Protocol) -> Sighting:
+    """Make the instance of an object.
 
-    Raises LeftOutError if it has no camera, no model, or too few keypoints; and DataError if its
-    model cannot be read.
+    Raises LeftOutError if the object has no camera, no model, or too few keypoints, and DataError
+    if its model cannot be read.
     """
     camera, cad = target.camera, target.found.model
     if camera is None:
-        raise LeftOutError("the photo's camera is not known")
+        raise LeftOutError("the photo's camera is unknown")
     if cad is None:
         raise LeftOutError("no model is annotated for the object")
     model = cad.load_keypoints()
     marks = target.found.keypoints
     if marks is None or model is None:
         raise LeftOutError("there are no keypoints")
-    names, pixels = _marked(marks, model)
+    names, pixels = _shared_marks(marks, model)
     if len(names) < _LEAST_KEYPOINTS:
         raise LeftOutError(f"{len(names)} keypoints are fewer than {_LEAST_KEYPOINTS}")
     bounds, gt = target.bounds, target.gt
-    assert bounds is not None  # of the keypoints at least
+    assert bounds is not None  # keypoints have bounds
     row_of = {name: row for row, name in enumerate(model.names)}
     points, width = model.xyz[[row_of[name] for name in names]], float(gt.scale[0]) if gt else 1.0
     sigma = _sigma(target, protocol)
@@ -234,25 +235,25 @@ def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
         bounds=bounds,
         width=width,
         protocol=protocol,
-        given=given if camera.focal_known else _calibrated(given),
+        input=given if camera.focal_known else _estimate_focal(given),
     )
 
 
-def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
-    """The visible keypoints that the model has, and their pixels."""
+def _shared_marks(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
+    """The visible keypoints that the model also has, and their pixels."""
     good = np.isin(marks.names, model.names)
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 
 def _sigma(target: PhotoTarget, protocol: Protocol) -> float:
-    """The standard deviation of keypoints [px] that methods are given."""
+    """The standard deviation of keypoints [px] as methods get it."""
     if protocol.sigma_of_width is not None and target.photo.camera is not None:
         return protocol.sigma_of_width * target.photo.camera.width
     left, top, right, bottom = rectangle_of(target.found)
     return max(_SIGMA_OF_SIDE * float(max(right - left, bottom - top)), _LEAST_PX)
 
 
-def _calibrated(given: MethodInput) -> MethodInput:
+def _estimate_focal(given: MethodInput) -> MethodInput:
     found = fit(
         given.points_3d,
         given.points_2d,

@@ -1,4 +1,4 @@
-"""Unseen objects, which are no stretched copy of any model: tasks, methods, errors and records."""
+"""Unseen objects, not stretched copies of known models: tasks, methods, errors and records."""
 
 from __future__ import annotations
 
@@ -46,25 +46,25 @@ from cadalign.metrics import (
 )
 from cadalign.shapes.model import ShapeModel
 
-# Free of the size: log(y / x) and log(z / x).
+# Maps logs of lengths to log(y / x) and log(z / x), which do not depend on size.
 _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
 
 def unseen_tasks(dataset: KeypointNet, options: UnseenOptions) -> KeypointTasks:
-    """All views of all objects of a split in the order of their names."""
+    """All views of all objects of a split, sorted by name."""
     objects = dataset.subset(categories=options.categories, split=options.split)
     return KeypointTasks(objects, options)
 
 
 @dataclass(frozen=True, eq=False)
 class UnseenObject:
-    """View of an object, whose scale is 1, and what was learned of its category from others."""
+    """View of an object with the true scale 1, and the shapes learned from other objects."""
 
     task: KeypointTask  # names and keypoints of the object
     options: UnseenOptions
     gt: Alignment  # the pose
-    rows: IntArray  # (n,), rows of the given keypoints among all of the object
-    points_2d: FloatArray  # (n, 2), the given keypoints [px], with noise
+    rows: IntArray  # (n,), rows of the observed keypoints among all keypoints of the object
+    points_2d: FloatArray  # (n, 2), the observed keypoints [px], with noise
     learned: Path = Path()  # folder of the shape models by category
 
     @property
@@ -74,7 +74,7 @@ class UnseenObject:
 
     @property
     def ids(self) -> IntArray:
-        """Semantic ids of the given keypoints, (n,) int."""
+        """Semantic ids of the observed keypoints, (n,) int."""
         return self.task.ids[self.rows]
 
     @property
@@ -83,18 +83,18 @@ class UnseenObject:
         return learned_shape(self.learned, self.task.category)
 
     def view_of(self, model: Model | ShapeModel) -> View:
-        """Those given keypoints that a model has."""
+        """The view with the observed keypoints that a model has."""
         shared = np.isin(self.ids, np.array(model.ids, dtype=np.int64))
         ids, pixels = self.ids[shared].tolist(), self.points_2d[shared]
         return View(KEYPOINT_CAMERA, pixels, ids=ids, sigma=self.options.sigma)
 
 
 def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
-    """Draw a view of an object, the keypoints that are given, and their noise.
+    """Draw a view of an object, a selection of keypoints, and their noise.
 
-    Views are those of `sample_hull_view`; hidden keypoints may be given, too. Everything random
-    follows from (seed, category, model id, view): view, order of keypoints and unit noise are the
-    same whatever the noise and the number of keypoints.
+    Views are drawn by `sample_hull_view`; hidden keypoints may be selected, too. View, order of
+    keypoints and unit noise depend only on (seed, category, model id, view), not on the noise level
+    or the number of keypoints.
     """
     if task.problem:
         raise DataError(task.problem)
@@ -115,23 +115,23 @@ def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
 
 @dataclass(frozen=True, eq=False)
 class ShapeEstimate:
-    """Pose and shape of an object as a method found them."""
+    """Estimated pose and shape of an object."""
 
     alignment: Alignment
-    bounds: FloatArray  # (2, 3), least and greatest coordinates before the stretch
+    bounds: FloatArray  # (2, 3), lowest and highest coordinates before the stretch
     ids: IntArray  # (m,)
     points_3d: FloatArray  # (m, 3), keypoints before the stretch
-    result: Result | None = None  # with the covariances; None for methods that have none
+    result: Result | None = None  # None for methods without covariances
 
     @classmethod
     def of(cls, result: Result) -> ShapeEstimate:
-        """The estimate of a result, whose keypoints have semantic ids."""
+        """Make the estimate of a result, whose keypoints have semantic ids."""
         ids = np.array(result.ids, dtype=np.int64)
         return cls(result.alignment, result.bounds, ids, result.points_3d, result)
 
 
 def solve_object(seen: UnseenObject, *, method: str) -> ShapeEstimate:
-    """The estimate of a method by name; see `UnseenOptions.methods`."""
+    """Estimate an object by a method's name; see `UnseenOptions.methods`."""
     model: Model | ShapeModel = seen.shape
     if method == LIMIT:
         points, pixels = seen.xyz[seen.rows], seen.points_2d
@@ -147,10 +147,10 @@ def solve_object(seen: UnseenObject, *, method: str) -> ShapeEstimate:
 
 
 def unseen_benchmark(learned: Path, options: UnseenOptions) -> Benchmark:
-    """The methods of the options on unseen objects."""
+    """The benchmark of the chosen methods on unseen objects."""
     own = {name: Method(name, partial(solve_object, method=name)) for name in METHODS}
     setting = UnseenObjects(learned, options)
-    return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
+    return Benchmark.of(setting, options.methods, own, metrics=options.metrics)
 
 
 # Errors -------------------------------------------------------------------------------------------
@@ -158,7 +158,7 @@ def unseen_benchmark(learned: Path, options: UnseenOptions) -> Benchmark:
 
 @dataclass(frozen=True)
 class UnseenObjects(Setting):
-    """Objects with what was learned from others: the setting of the experiment."""
+    """Instances of the experiment: objects with shapes learned from other objects."""
 
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
@@ -171,7 +171,7 @@ class UnseenObjects(Setting):
         facts = {"keypoints": len(seen.points_2d)}
         return Case(task.names, facts, replace(seen, learned=self.learned))
 
-    def given(self, seen: UnseenObject) -> MethodInput:
+    def method_input(self, seen: UnseenObject) -> MethodInput:
         shape = seen.shape
         known = np.isin(seen.ids, shape.ids)
         points = shape.mean[shape.rows(seen.ids[known].tolist())]
@@ -184,7 +184,7 @@ class UnseenObjects(Setting):
             gt=seen.gt,
         )
 
-    def answered(
+    def estimate_of(
         self, method: Method, seen: UnseenObject, answer: Alignment | Result
     ) -> ShapeEstimate:
         shape = seen.shape
@@ -202,7 +202,7 @@ class UnseenObjects(Setting):
         seen: UnseenObject = case.instance
         return record_of(
             outcomes,
-            [e if isinstance(e, Exception) else _described(e, seen) for e in estimates],
+            [e if isinstance(e, Exception) else _describe(e, seen) for e in estimates],
             camera=KEYPOINT_CAMERA,
             gt=seen.gt,
             bounds=seen.task.hull.bounds,
@@ -234,7 +234,7 @@ def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
 
 
 def _shared(found: ShapeEstimate, seen: UnseenObject) -> tuple[IntArray, IntArray]:
-    """Rows of the object's keypoints that an estimate has, and their rows in it."""
+    """Rows of the shared keypoints in the object and in the estimate."""
     row_of = {name: row for row, name in enumerate(found.ids.tolist())}
     ids = seen.task.ids.tolist()
     known = np.flatnonzero([name in row_of for name in ids])
@@ -242,16 +242,15 @@ def _shared(found: ShapeEstimate, seen: UnseenObject) -> tuple[IntArray, IntArra
 
 
 def _distance_up_to_scale(est: FloatArray, gt: FloatArray) -> float:
-    """Root mean square distance of points (n, 3), the estimated ones scaled about the origin."""
+    """Root mean square distance of points (n, 3) after scaling the estimate about the origin."""
     factor = (est * gt).sum() / (est * est).sum()
     return float(np.sqrt(((factor * est - gt) ** 2).sum(axis=1).mean()))
 
 
 def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArray) -> Row:
-    """Place of the truth in the stated probabilities; metrics by column.
+    """Levels of the stated regions that hold the truth, by column; see `probability_level`.
 
-    ``known`` are the rows of the object's keypoints that the model has, ``rows`` those of the
-    model's keypoints that they are.
+    ``known`` and ``rows`` are the rows of the shared keypoints in the object and in the model.
     """
     est = result.alignment
     turn = vector_from_rotation(est.rotation @ seen.gt.rotation.T)
@@ -278,7 +277,7 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
     }
 
 
-def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
+def _describe(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
     known, rows = _shared(found, seen)
     return aligned_shape(
         found,

@@ -1,4 +1,4 @@
-"""Errors of estimates by column of the result table, those of an ideal estimator, stated levels."""
+"""Errors of estimates by column, the Cramer-Rao bound, and coverage of stated uncertainties."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
-# Smallest share of a covariance's largest eigenvalue that counts as variance.
+# Smaller eigenvalues, relative to the largest one, count as no variance.
 _NO_VARIANCE = 1e-12
-_OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns where x has the scale 1, focal length known
+_OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns of a pose with scales (1, s_y, s_z)
 
 
 def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
-    """Errors of pose and stretch by column, the translation's over a length [model units]."""
+    """Errors of pose and stretch by column; ``length`` [model units] divides the translation's."""
     _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
     return {
         "rotation_error_deg": rotation_error(est=est, gt=gt),
@@ -56,7 +56,7 @@ def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> d
 
 
 def overlap(*, est: Box, gt: Box, up_to_scale: bool = False) -> float | None:
-    """Intersection over union of two boxes; None where one has no volume.
+    """Intersection over union of two boxes; None if one has no volume.
 
     ``up_to_scale`` scales the estimate about the camera centre first.
     """
@@ -72,9 +72,9 @@ def estimate_errors(
     instances: Sequence[Instance],
     symmetries: Sequence[Symmetry],
 ) -> list[Row | InputError]:
-    """Errors of an estimate of each instance; the reason where one is not finite.
+    """Errors of one estimate per instance, by column; an InputError if it is not finite.
 
-    The instances are of one camera; ``symmetries`` are those of their models.
+    All instances have the same camera. ``symmetries`` belong to their models.
     """
     if not estimates:
         return []
@@ -116,7 +116,7 @@ def estimate_errors(
 def _pose_errors(
     est: Alignments, gt: Alignments, bounds: FloatArray, diagonals: FloatArray
 ) -> dict[str, FloatArray]:
-    """Errors that a symmetry changes; the box IoU of a model without volume is NaN."""
+    """Errors that depend on symmetry; the box IoU of a model without volume is NaN."""
     boxes, gt_boxes = Boxes.from_models(bounds, est), Boxes.from_models(bounds, gt)
     solid = have_volume(boxes) & have_volume(gt_boxes)
     ious = np.full(len(bounds), np.nan)
@@ -132,7 +132,7 @@ def _pose_errors(
 
 
 def _rms_px(estimates: Sequence[Alignment], instances: Sequence[Instance]) -> FloatArray:
-    """Root mean square residuals (n,) [px]; also of the bound's estimates behind the camera."""
+    """Root mean square residuals (n,) [px], also of estimates behind the camera."""
     pairs = zip(estimates, instances, strict=True)
     placed = [each.points_3d @ est.linear.T + est.translation for est, each in pairs]
     camera = instances[0].camera
@@ -144,11 +144,11 @@ def _rms_px(estimates: Sequence[Alignment], instances: Sequence[Instance]) -> Fl
     return np.sqrt(means)
 
 
-# An ideal estimator, and stated uncertainties -----------------------------------------------------
+# Cramer-Rao bound and coverage --------------------------------------------------------------------
 
 
 def scaled_columns(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Equations with columns of length 1, and the lengths; raises DegenerateError if degenerate."""
+    """Scale columns to length 1 and return their lengths; raises DegenerateError if singular."""
     norms = np.linalg.norm(rows, axis=0)
     scaled = rows / np.where(norms > 0, norms, 1.0)
     if len(rows) < rows.shape[1] or np.linalg.eigvalsh(scaled.T @ scaled)[0] < _LEAST_INFORMATION:
@@ -161,10 +161,9 @@ def limit_estimate(
 ) -> Alignment:
     """Estimate of an ideal estimator from noisy observations (n, 2) [px], to first order.
 
-    The Gauss-Newton step from the truth, (J' J)^-1 J' e with the noise e of the observations. Over
-    the noise its errors have exactly the Cramer-Rao bound as their covariance; the noise is that of
-    the compared methods, so that no chance enters the comparison. The truth has the scale 1 along
-    x, the camera no lens distortion.
+    The Gauss-Newton step from the truth, (J' J)^-1 J' e with the noise e of the observations. The
+    covariance of its errors is the Cramer-Rao bound. It uses the same noise as the compared
+    methods. The truth must have the scale 1 along x, and the camera no lens distortion.
     """
     jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
     jacobian = jacobian.reshape(-1, UNKNOWNS)
@@ -185,11 +184,10 @@ def probability_level(
 ) -> float | None:
     """Probability of the smallest ellipsoid about the estimate that holds the truth.
 
-    ``error`` (k,) is estimate minus truth, ``covariance`` (k, k) as the estimator states it, where
-    directions without variance are held to be known; with ``degrees_of_freedom`` errors follow a t
-    distribution, without a Gaussian. The level is uniform over [0, 1] where the covariance is that
-    of the errors, 1 if the error has a part in a direction without variance, and None if there is
-    no variance at all.
+    ``error`` (k,) is estimate minus truth; ``covariance`` (k, k) is the stated one. Errors follow a
+    t distribution with ``degrees_of_freedom``, or a Gaussian if None. Levels are uniform over
+    [0, 1] if the stated covariance is right. The level is 1 if the error has a component in a
+    direction without variance, and None if there is no variance at all.
     """
     if not np.isfinite(covariance).all():
         return None

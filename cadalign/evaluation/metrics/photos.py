@@ -1,7 +1,7 @@
-"""Metrics of photos: those of PASCAL3D+, of boxes, and of Scan2CAD.
+"""Metrics on photos: viewpoints (PASCAL3D+), boxes (NOCS), and alignments (Scan2CAD).
 
-A new metric of photos is a cell of a measure, and a line of `MEDIANS` or `RATES`; a new data set
-has its measures in `cadalign.evaluation.experiments.photos`.
+A new metric is a column of a measure, listed in `MEDIANS` or `RATES`. The measures of each data set
+are chosen in `cadalign.evaluation.experiments.photos`.
 
 Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1: accuracy at pi/6, median error.
 Wang et al., "Normalized Object Coordinate Space for Category-Level 6D Object Pose and Size
@@ -23,7 +23,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap
 from cadalign.evaluation.runs.work import Row
-from cadalign.evaluation.summary import Group, known, medians
+from cadalign.evaluation.summary import Group, drop_nan, medians
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
@@ -35,22 +35,22 @@ if TYPE_CHECKING:
     from cadalign.evaluation.summary import Statistics
 
 Measure = Callable[["PhotoTarget", Alignment, Alignment, Box], Row]
-"""Errors by column, some of which may lack: of an object, an estimate of the data set's model, the
-true one, and the estimated box, all in the frame of the photo's camera."""
+"""Function of an object, the estimated and the true alignment of the data set's model, and the
+estimated box, in the camera frame. Returns errors by column; some may be missing."""
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A share of objects, of those that have a value of a column."""
+    """A share of the objects with a value in a column."""
 
     metric: Metric
     column: Metric
     limit: float | None = None
-    """Values below it count; without one, those that are not 0."""
+    """Values below the limit count; without a limit, values above 0."""
 
     def of(self, group: Group) -> float:
-        """The share; failures count as misses."""
-        values = known(group.solved[self.column.key])
+        """The share in a group; failures count as misses."""
+        values = drop_nan(group.solved[self.column.key])
         count = len(values) + len(group.rows["method"]) - len(group.solved["method"])
         within = values > 0 if self.limit is None else values < self.limit
         return int(within.sum()) / count if count else np.nan
@@ -58,32 +58,32 @@ class Rate:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Evaluation of a data set: its metrics, and what it is given."""
+    """Protocol of a data set: metrics, upward axis, and keypoint noise."""
 
     measures: tuple[Measure, ...]
     up_axis: str = "y"  # the upward axis of its models
     sigma_of_width: float | None = None
-    """Standard deviation of its keypoints as a share of the image's width, by default 1/64 of the
-    longer side of the object's rectangle."""
+    """Standard deviation of the keypoints relative to the image width; by default it is 1/64 of the
+    longer side of the object's bounding rectangle."""
 
     def score(self, target: PhotoTarget, est: Alignment, box: Box) -> Row:
-        """Errors of an estimate by column; none where the truth is not known."""
+        """Errors of an estimate by column; empty if the truth is unknown."""
         gt = target.gt
         rows = [] if gt is None else [each(target, est, gt, box) for each in self.measures]
         return {name: value for row in rows for name, value in row.items()}
 
 
 def statistics_of(cells: Cells) -> Statistics:
-    """Medians of the objects that did not fail, and shares of all whose truth is known.
+    """Medians over objects that did not fail, and shares of all objects with a known truth.
 
-    Shares of a column that has no value in a whole table, of ``cells``, are left out.
+    Shares are left out if their column is empty in ``cells``.
     """
-    shares = {rate.metric.key: rate.of for rate in RATES if len(known(cells[rate.column.key]))}
+    shares = {rate.metric.key: rate.of for rate in RATES if len(drop_nan(cells[rate.column.key]))}
     return {**medians(*MEDIANS), **shares}
 
 
 def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> float:
-    """Rotation error [degrees] over all of a model's symmetries: protocols know no stretch."""
+    """Rotation error [degrees] up to the symmetry of the unstretched model."""
     return rotation_error(est=est, gt=replace(gt, scale=np.ones(3)), symmetry=symmetry)
 
 
@@ -91,26 +91,26 @@ def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -
 
 _ACCURACY_DEG = 30.0  # pi/6
 ROTATION = replace(metrics.ROTATION, digits=2)
-_ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "Acc pi/6")
+_ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "acc pi/6 %")
 
 
 def measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    """The error of the viewpoint, over the object's symmetries."""
+    """Rotation error up to the object's symmetry."""
     error = model_rotation_error(est=est, gt=gt, symmetry=target.found.symmetry)
     return {ROTATION.key: error}
 
 
 # Boxes --------------------------------------------------------------------------------------------
 
-_STEPS = 20  # about an axis of symmetry, as NOCS tries
+_STEPS = 20  # about an axis of symmetry, as in NOCS
 
 
 def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
     """Largest IoU of the true box and the estimated one over the object's symmetries.
 
-    As in NOCS, the estimate is turned about its own centre by the symmetries' rotations, those
-    about an axis in 20 steps; the boxes' axes are the model's. Raises InputError if a box has no
-    volume.
+    As in NOCS, the estimate is rotated about its own centre by the rotations of the symmetry, in 20
+    steps about each axis of symmetry. The axes of the boxes are the model's. Raises InputError if a
+    box has no volume.
     """
     angles = 2 * np.pi * np.arange(_STEPS) / _STEPS
     about = [rotation_from_vector(angle * axis) for axis in symmetry.axes for angle in angles]
@@ -120,7 +120,7 @@ def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
 
 
 def measure_box(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    """The overlap of the boxes."""
+    """Intersection over union of the boxes."""
     gt_box = target.gt_box
     if gt_box is None or min(box.volume, gt_box.volume) <= 0:
         return {}
@@ -146,13 +146,14 @@ def scan2cad_errors(
     symmetry: Symmetry | None = None,
     center: FloatArray | None = None,
 ) -> Row:
-    """Errors of an estimate of a true alignment, in metres, by column.
+    """Errors of an alignment by column; alignments are in metres.
 
-    Positions of the point ``center`` (3,) of the model are compared, by default of its origin.
-    Rotations about an axis of symmetry are compared exactly; the benchmark's script takes steps of
-    10 degrees there, so that its errors are larger by up to 5 degrees. The scale's error is the
-    benchmark's: the mean over the axes of the ratio to the truth, less 1. Errors of opposite sign
-    cancel in it; aligned on each axis is what none of them is over the threshold of.
+    The translation error is the distance between the estimated and the true position of the model's
+    point ``center`` (3,), by default its origin. Rotations about an axis of symmetry are free; the
+    benchmark's script tries them in steps of 10 degrees, so its errors are larger by up to 5
+    degrees. The scale error is the benchmark's: abs(mean(estimate / truth over the axes) - 1).
+    Errors of opposite sign cancel in it; ``scan2cad_aligned_axes`` requires each axis within the
+    threshold.
     """
     point = np.zeros(3) if center is None else center
     gap = est.apply([point])[0] - gt.apply([point])[0]
@@ -171,17 +172,17 @@ def scan2cad_errors(
 
 
 def measure_scan2cad(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    """The errors of `scan2cad_errors`, at the centre that the benchmark's script takes."""
-    # That is minus the centre of the model's box.
+    """Errors of `scan2cad_errors` at the centre that the benchmark's script uses."""
+    # The script uses minus the centre of the model's box.
     center = None if target.bounds is None else -target.bounds.mean(axis=0)
     return scan2cad_errors(est=est, gt=gt, symmetry=target.found.symmetry, center=center)
 
 
 MEDIANS = (*(ROTATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, _TRANSLATION_M, _SCALE),)
-"""Columns whose medians are shown."""
+"""Columns reported as medians."""
 RATES = (
     Rate(_ACCURACY, ROTATION, _ACCURACY_DEG),
     Rate(_ALIGNED, _ALIGNED),
     Rate(_ALIGNED_AXES, _ALIGNED_AXES),
 )
-"""Shares of objects that are shown."""
+"""Reported shares of objects."""

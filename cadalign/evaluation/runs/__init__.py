@@ -1,1 +1,1 @@
-"""The engine of experiments: tasks, workers, and folders that resume."""
+"""Runs of experiments: tasks, workers, and folders of resumable runs."""

@@ -1,11 +1,10 @@
-"""Engine of runs: chunks of tasks on an executor, in a folder, killed and started again.
+"""Engine of resumable runs: evaluates chunks of tasks on an executor and collects their rows.
 
-One loop serves every executor of the standard library's interface: threads of this process,
-processes of this machine, a Dask cluster. A finished chunk is a file in ``parts`` of the run's
-folder (`cadalign.evaluation.runs.folder`), which appears whole or not at all. Started again, a run
-does the chunks that have none. Chunks are the same whatever the number of workers, and their rows
-follow from the run's seed and the tasks' names, so nothing in ``results.parquet`` shows how often
-the run was interrupted or who did the work.
+One loop serves every `concurrent.futures.Executor`: threads of this process, processes of this
+machine, or a Dask cluster. A finished chunk is a file in ``parts`` of the run's folder
+(`cadalign.evaluation.runs.folder`), which is written atomically. A restarted run evaluates the
+chunks without a file. Chunks do not depend on the number of workers, and their rows depend only on
+the run's seed and the tasks' names, so ``results.parquet`` is reproducible.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from typing import Any, TypeVar
 from cadalign.arrays import is_whole as is_integer
 from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, InputError, quote
-from cadalign.evaluation.runs.executors import cluster, in_threads, processes
+from cadalign.evaluation.runs.executors import dask_cluster, process_pool, thread_pool
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import SECONDS, read_cells, write_rows, write_tables
 from cadalign.evaluation.runs.work import AbortError, Columns, Experiment, Plan, Row, reason_of
@@ -34,15 +33,15 @@ from cadalign.io.files import made_folder
 
 T = TypeVar("T")
 Chunk = tuple[int, Sequence[Any]]
-"""Number of a chunk, and its tasks."""
+"""Index of a chunk, and its tasks."""
 
 KILLED_REASON = "its chunk killed a worker process twice (a crash, or out of memory)"
-_MOST_DEATHS = 3  # of executors in succession that finish nothing
+_MOST_DEATHS = 3  # of executors in succession without a finished chunk
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Number of tasks that are done, and of all."""
+    """Numbers of finished tasks and of all tasks."""
 
     done: int
     total: int
@@ -53,19 +52,19 @@ OnProgress = Callable[[Progress], object]
 
 @dataclass(frozen=True)
 class Workers:
-    """Place where chunks are evaluated."""
+    """Executor of chunks, and how it fails."""
 
     open: Callable[[], AbstractContextManager[tuple[Executor, int]]]
-    """Opens an executor, and says how many chunks it is given at a time."""
+    """Opens an executor; also returns the maximum number of pending chunks."""
     deaths: tuple[type[Exception], ...] = ()
-    """Errors of a future whose worker has died; none of threads, which experiments are not sent
-    to."""
+    """Errors of a future whose worker has died; empty for threads. If it is not empty, experiments
+    are pickled."""
 
 
 def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
     """Choose workers by options; see `cadalign.evaluation.options.RunOptions`.
 
-    ``threads`` share the work of a run without workers.
+    A run without worker processes uses this many ``threads``.
     """
     if dask is not None:
         try:
@@ -73,17 +72,17 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
         except ImportError:
             fix = "pip install 'cadalign[dask]'"
             raise CadalignError("Dask is not installed", where="--dask", fix=fix) from None
-        # Of a scheduler that is gone, all calls are cancelled; to connect anew tells of it.
-        return Workers(partial(cluster, dask), (KilledWorker, CancelledError))
+        # A lost scheduler cancels all calls; the error comes from the attempt to reconnect.
+        return Workers(partial(dask_cluster, dask), (KilledWorker, CancelledError))
     if not is_integer(count) or count < -1:
         raise InputError(
             f"{quote(count)} is not a number of processes",
             where="workers",
-            fix="give 1 or more, -1 for one for each core, 0 for none",
+            fix="give 1 or more, -1 for one per core, or 0 for this process alone",
         )
     if count:
-        return Workers(partial(processes, worker_count(count)), (BrokenProcessPool,))
-    return Workers(partial(in_threads, threads))
+        return Workers(partial(process_pool, worker_count(count)), (BrokenProcessPool,))
+    return Workers(partial(thread_pool, threads))
 
 
 def execute(
@@ -93,7 +92,7 @@ def execute(
     workers: Workers,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
-    """Do a run, or what is left of it; ``on_progress`` is told of every chunk."""
+    """Run a plan or continue it; ``on_progress`` is called after every chunk."""
     folder.make()
     experiment, total = plan.experiment, len(plan.tasks)
     with folder.locked():
@@ -103,7 +102,7 @@ def execute(
             _do_chunks(plan, folder, workers, on_progress)
             parts = [folder.part(k) for k in range(-(-total // plan.chunk_size))]
             tables = {folder.timings: SECONDS, folder.records: experiment.record_columns}
-            # The results last: they say that the run is done.
+            # The results last: they mark the run as finished.
             for path, columns in {**tables, folder.results: experiment.columns}.items():
                 if columns:
                     is_record = path == folder.records
@@ -123,14 +122,14 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
     on_progress(Progress(done, len(tasks)))
     chunks = ((index, tasks[starts[index] : starts[index] + size]) for index in missing)
-    for (index, some), rows in evaluated(workers, experiment, chunks):
+    for (index, some), rows in evaluate_chunks(workers, experiment, chunks):
         write_rows(folder.part(index), columns, rows)
         done += len(some)
         on_progress(Progress(done, len(tasks)))
 
 
 def _sweep(path: Path) -> None:
-    """Remove what a killed process left half written."""
+    """Remove unfinished files of killed processes."""
     for unfinished in path.glob(".unfinished-*"):
         unfinished.unlink(missing_ok=True)
 
@@ -138,43 +137,43 @@ def _sweep(path: Path) -> None:
 # Chunks -------------------------------------------------------------------------------------------
 
 
-def evaluated(
+def evaluate_chunks(
     workers: Workers, experiment: Experiment[Any], chunks: Iterable[Chunk]
 ) -> Iterator[tuple[Chunk, list[Row]]]:
-    """Evaluate chunks, each of which is yielded with its rows, in any order.
+    """Evaluate chunks and yield each with its rows, in any order.
 
-    The chunks of a worker that died are done again in the end, one at a time; one that kills its
-    worker then, too, becomes failed rows.
+    Chunks of workers that died are repeated at the end, one at a time. A chunk that kills its
+    worker again gets failed rows.
     """
     call = partial(evaluate_chunk, experiment)
     if workers.deaths:
-        call = partial(_evaluate_pickled, _pickled(experiment))
+        call = partial(_evaluate_pickled, _pickle(experiment))
     lost: list[Chunk] = []
-    yield from _pass(workers, call, chunks, lost)
+    yield from _evaluate_once(workers, call, chunks, lost)
     for chunk in lost:
         lost_again: list[Chunk] = []
-        yield from _pass(workers, call, [chunk], lost_again)
+        yield from _evaluate_once(workers, call, [chunk], lost_again)
         if lost_again:
             failures = [experiment.failure(task, KILLED_REASON) for task in chunk[1]]
             yield chunk, [row for rows in failures for row in rows]
 
 
-def _pass(
+def _evaluate_once(
     workers: Workers, call: Callable[..., Any], chunks: Iterable[Chunk], lost: list[Chunk]
 ) -> Iterator[tuple[Chunk, list[Row]]]:
-    """Evaluate chunks as fast as their rows are taken; those of dead workers are appended."""
+    """Evaluate chunks once; chunks of dead workers are appended to ``lost``."""
     source, deaths = iter(chunks), 0
     running: dict[Future[list[Row]], Chunk] = {}
-    window = 1  # the first chunk alone: it compiles the kernels that all workers need
+    window = 1  # the first chunk alone compiles the kernels for all workers
     while True:
-        reason = ""  # why the executor is dead
+        reason = ""  # set once the executor is dead
         with workers.open() as (executor, size):
             while True:
                 for chunk in islice(source, 0 if reason else window - len(running)):
                     try:
                         running[executor.submit(call, chunk[1])] = chunk
                     except Exception as error:
-                        # The pool is closing since a process has died, or the scheduler is gone.
+                        # A process of the pool has died, or the scheduler is lost.
                         if not workers.deaths:
                             raise
                         reason = reason_of(error)
@@ -192,7 +191,7 @@ def _pass(
                         reason = reason_of(error)
                         lost.append(chunk)
                     except Exception as error:
-                        raise _cannot_work(error) from error
+                        raise _worker_error(error) from error
                     else:
                         window, deaths = size, 0
                         yield chunk, rows
@@ -200,22 +199,22 @@ def _pass(
             return
         deaths += 1
         if deaths == _MOST_DEATHS:
-            fix = "is there enough memory? Try fewer workers, or none (0) to see the error"
-            what = f"worker processes die before they finish anything: {reason}"
+            fix = "there may be too little memory: try fewer workers, or 0 to see the error"
+            what = f"worker processes die before they finish a chunk: {reason}"
             raise CadalignError(what, where="workers", fix=fix)
 
 
-def _cannot_work(error: Exception) -> CadalignError:
+def _worker_error(error: Exception) -> CadalignError:
     return CadalignError(
-        f"a worker cannot work: {reason_of(error)}",
+        f"a worker failed: {reason_of(error)}",
         where="workers",
-        fix="cadalign must be installed there, in the same version as here, and modules of your "
-        "functions, too",
+        fix="install the same version of cadalign, and the modules of your functions, for every "
+        "worker",
     )
 
 
 def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> list[Row]:
-    """Evaluate tasks; one that raises becomes failed rows and does not stop the others."""
+    """Evaluate tasks; a task that raises gets failed rows."""
     try:
         return experiment.evaluate(tasks)
     except AbortError as error:
@@ -226,8 +225,8 @@ def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> list[Row]:
     return [row for task in tasks for row in evaluate_chunk(experiment, [task])]
 
 
-def _pickled(experiment: Experiment[Any]) -> bytes:
-    """The experiment for other processes; raises InputError for functions they cannot import."""
+def _pickle(experiment: Experiment[Any]) -> bytes:
+    """Pickle an experiment; raises InputError for functions that workers cannot import."""
     try:
         pickled = pickle.dumps(experiment)
         reason = "it is defined in a script or a notebook" if b"__main__" in pickled else ""
@@ -237,15 +236,14 @@ def _pickled(experiment: Experiment[Any]) -> bytes:
         raise InputError(
             f"a function cannot be sent to worker processes ({reason})",
             where="workers",
-            fix="define it in a module that they can import, or name it module:function; or do "
-            "without them (0)",
+            fix="define it in an importable module, give module:function, or set workers to 0",
         )
     return pickled
 
 
-# One object for all chunks of a process: what it keeps at hand is not made anew.
-_unpickled = lru_cache(maxsize=1)(pickle.loads)
+# One object for all chunks of a process, so that its caches last.
+_unpickle = lru_cache(maxsize=1)(pickle.loads)
 
 
 def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> list[Row]:
-    return evaluate_chunk(_unpickled(pickled), tasks)
+    return evaluate_chunk(_unpickle(pickled), tasks)

@@ -1,7 +1,6 @@
 """Executors of runs: threads, processes of this machine, and the workers of a Dask cluster.
 
-Each is opened as a context manager, which gives the executor, and how many chunks it is given at a
-time.
+Each is a context manager that yields the executor and the maximum number of pending chunks.
 """
 
 from __future__ import annotations
@@ -21,27 +20,27 @@ from typing import Any
 from cadalign.errors import DataError
 from cadalign.io.files import printable
 
-# Sums that several threads share are rounded in another order than those of one.
+# One thread per worker: the rounding of sums depends on the number of threads.
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @contextmanager
-def in_threads(count: int) -> Iterator[tuple[Executor, int]]:
-    """Threads of this process, for what lets go of the interpreter lock."""
-    with _cancelling(ThreadPoolExecutor(count)) as executor:
+def thread_pool(count: int) -> Iterator[tuple[Executor, int]]:
+    """Threads of this process, for functions that release the interpreter lock."""
+    with _cancel_at_exit(ThreadPoolExecutor(count)) as executor:
         yield executor, count
 
 
 @contextmanager
-def processes(count: int) -> Iterator[tuple[Executor, int]]:
-    """Processes of one thread each, which do not run this one's script again."""
+def process_pool(count: int) -> Iterator[tuple[Executor, int]]:
+    """Processes with one thread each, which do not import this process's main script."""
     main, kept = sys.modules["__main__"], {name: os.environ.get(name) for name in _ENVIRONMENT}
     sys.modules["__main__"] = ModuleType("__main__")
     os.environ.update(_ENVIRONMENT)
     try:
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
-        with _cancelling(pool) as executor:
+        with _cancel_at_exit(pool) as executor:
             yield executor, count + 1
     finally:
         sys.modules["__main__"] = main
@@ -52,8 +51,8 @@ def processes(count: int) -> Iterator[tuple[Executor, int]]:
 
 
 @contextmanager
-def _cancelling(executor: Executor) -> Iterator[Executor]:
-    """The executor; at the end it finishes what it is doing, and does not begin anything else."""
+def _cancel_at_exit(executor: Executor) -> Iterator[Executor]:
+    """Yield the executor; at the end, cancel pending calls and wait for running ones."""
     try:
         yield executor
     finally:
@@ -61,8 +60,8 @@ def _cancelling(executor: Executor) -> Iterator[Executor]:
 
 
 def _start_worker() -> None:
-    sys.stdout = sys.stderr  # what functions print is not the command's output
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # without a traceback from each
+    sys.stdout = sys.stderr  # keep prints of functions out of the command's output
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback from each process
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -74,17 +73,17 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor, int]]:
+def dask_cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor, int]]:
     """The Dask cluster of a scheduler's address, such as tcp://10.0.0.1:8786.
 
-    Its workers need the same version of cadalign, and the same folders under the same names. Dask
-    itself hands a chunk whose worker dies to others, until its ``allowed-failures`` are exceeded.
-    ``timeout`` is that of the scheduler, and of its first worker [s].
+    Workers need the same version of cadalign, and the same folders at the same paths. Dask repeats
+    the chunk of a dead worker on others, up to its setting ``allowed-failures``. ``timeout`` [s]
+    limits the wait for the scheduler and for the first worker.
     """
     from distributed import Client
     from distributed.utils import silence_logging_cmgr
 
-    # Lost connections are errors for the user, without the client's tracebacks.
+    # Lost connections are reported as errors; the client's tracebacks would repeat them.
     with silence_logging_cmgr(logging.CRITICAL):
         try:
             # `distributed` is not typed throughout.
@@ -103,7 +102,7 @@ def cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor, 
             except TimeoutError:
                 fix = "start some with `dask worker ADDRESS`"
                 raise DataError("the Dask cluster has no workers", where=address, fix=fix) from None
-            # Named by chance: to name a chunk by its content takes longer than to evaluate it.
+            # pure=False: hashing the content of a chunk takes longer than evaluating it.
             executor = client.get_executor(pure=False)
-            # Clusters grow, and a round trip may cost more than a chunk.
+            # Twice the threads: a round trip may take longer than a chunk.
             yield executor, 2 * sum(client.nthreads().values()) + 2

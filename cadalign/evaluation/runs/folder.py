@@ -1,4 +1,4 @@
-"""Folder of a run: its files (docs/formats/runs.md), its lock, and its configuration."""
+"""Folder of a run: its files (docs/formats/runs.md), lock and configuration."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _FIX = "give another folder (--out), or remove this one"
 _FIX_FOREIGN = "rename it, or give another --out"
 _LOCK = ".lock"
 _WRITTEN = ("results.csv", "summary.csv", "report.html", "records.parquet", "timings.parquet")
-"""Files of a run that somebody may have by the same name."""
+"""Files of a run with names that other programs may use, too."""
 
 
-class _Inside:
-    """A file or folder inside a run's folder."""
+class _PathInFolder:
+    """The path of a file or folder inside a run's folder."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -39,42 +39,42 @@ class _Inside:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run's folder."""
+    """The folder of a run."""
 
     path: Path
 
-    config_file = _Inside("run.json")
-    results = _Inside("results.parquet")
-    timings = _Inside("timings.parquet")
-    records = _Inside("records.parquet")
-    summary = _Inside("summary.csv")
-    figures = _Inside("figures")
-    pictures = _Inside("pictures")
-    thumbs = _Inside("thumbs")
-    previews = _Inside("previews")
-    report = _Inside("report.html")
-    parts = _Inside("parts")
+    config_file = _PathInFolder("run.json")
+    results = _PathInFolder("results.parquet")
+    timings = _PathInFolder("timings.parquet")
+    records = _PathInFolder("records.parquet")
+    summary = _PathInFolder("summary.csv")
+    figures = _PathInFolder("figures")
+    pictures = _PathInFolder("pictures")
+    thumbs = _PathInFolder("thumbs")
+    previews = _PathInFolder("previews")
+    report = _PathInFolder("report.html")
+    parts = _PathInFolder("parts")
 
     @property
     def is_finished(self) -> bool:
-        """True once all results are there."""
+        """True once all results are written."""
         return self.results.is_file()
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """The files that pages and tables are made from."""
+        """The input files of pages and tables."""
         return self.config_file, self.results, self.timings, self.records
 
     def part(self, index: int) -> Path:
-        """All cells of a chunk's rows."""
+        """The file of a chunk's rows, with the columns of all tables."""
         return self.parts / f"{index:07d}.parquet"
 
     def make(self) -> None:
-        """Make the folder."""
+        """Create the folder."""
         made_folder(self.path)
 
     def made_for_pictures(self) -> RunFolder:
-        """Make the folder and those in it that pictures go to; returns it by its full path."""
+        """Create the folder and its folders for pictures; returns it with its absolute path."""
         self.make()
         for path in (self.thumbs, self.pictures, self.previews):
             made_folder(path)
@@ -82,13 +82,13 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes out; a killed process holds no lock."""
+        """Lock the run against other processes; the lock of a killed process is released."""
         what = "another process is working on this run"
         with locked(self.path / _LOCK, what, fix="wait for it, or give another folder (--out)"):
             yield
 
     def read_config(self) -> dict[str, Any] | None:
-        """Read ``run.json``; None where there is none."""
+        """Read ``run.json``; None if it does not exist."""
         path = self.config_file
         refuse_nul(path)
         if not path.exists():
@@ -99,8 +99,8 @@ class RunFolder:
         return found
 
     def claim(self, config: dict[str, Any]) -> None:
-        """Write ``run.json``, or see that the one that is there says the same."""
-        # Results depend to their last bits on these versions.
+        """Write ``run.json``, or raise DataError if an existing one differs."""
+        # The last bits of results depend on these versions.
         names = ("cadalign", "numpy", "scipy", "numba", "pyarrow")
         versions = {name: version(name) for name in names}
         versions |= {"python": platform.python_version(), "machine": platform.machine()}
@@ -109,10 +109,10 @@ class RunFolder:
         found = self.read_config()
         if found is None:
             if self.parts.exists() or self.results.exists():
-                raise DataError("holds results, but no run.json", where=str(self.path), fix=_FIX)
+                raise DataError("holds results but no run.json", where=str(self.path), fix=_FIX)
             foreign = next((name for name in _WRITTEN if (self.path / name).exists()), None)
             if foreign is not None:
-                what = f"holds {foreign}, which is no run's: there is no {self.config_file.name}"
+                what = f"holds {foreign} but no {self.config_file.name}: not the folder of a run"
                 raise DataError(what, where=str(self.path), fix=_FIX_FOREIGN)
             write_json(self.config_file, wanted)
             return
@@ -125,7 +125,7 @@ class RunFolder:
 
 
 class _Config(ForeignDocument):
-    """Fields of ``run.json`` that all runs have, besides the experiment's own."""
+    """Fields of ``run.json`` that all experiments share."""
 
     experiment: str | None = None
     tasks: Count = 0
@@ -140,8 +140,8 @@ def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[str]:
             yield from _differences(found.get(key), wanted.get(key), inner)
     elif found != wanted:
         there, now = map(json.dumps, (found, wanted))
-        yield f"{name} is {_shortened(there)} there and {_shortened(now)} now"
+        yield f"{name} is {_shorten(there)} there and {_shorten(now)} now"
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

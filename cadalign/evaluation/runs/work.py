@@ -1,9 +1,8 @@
-"""Experiments as the engine sees them: tasks become table rows, chunk by chunk.
+"""Interface between experiments and the engine: tasks become table rows, chunk by chunk.
 
-An experiment is a small picklable object; a task is all that it needs to know of one instance, also
-picklable. Chunks are handled on any machine and in any order, and an experiment must not let its
-rows depend on that: all randomness comes from the run's seed and the task's name
-(`cadalign.arrays.instance_rng`).
+An experiment is a small picklable object. A task, also picklable, describes one instance. Rows must
+not depend on the machine or on the order of chunks: all randomness comes from the run's seed and
+the task's name (`cadalign.arrays.instance_rng`).
 """
 
 from __future__ import annotations
@@ -23,34 +22,34 @@ T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)
 
 Row = dict[str, Any]
-"""Cells of a table by column; what is missing or None is an empty cell."""
+"""Cells of a table by column; missing cells and None are empty."""
 Columns = tuple[tuple[str, Any], ...]
-"""Names of a table's columns and their types: str, int, float or bool."""
+"""Names and types of a table's columns: str, int, float or bool."""
 
 COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
-"""Columns of the result table of every experiment."""
+"""Columns that every result table has."""
 OK = "ok"
 FAILED = "failed"
 LEFT_OUT = "left out"
-"""Status of an instance, or a method on it, that lacks what is asked for: neither failed nor ok."""
+"""Status of an instance that lacks an input of the method: neither failed nor ok."""
 UNREADABLE = "unreadable"
-"""The category of records that cannot be read."""
+"""Category of records that cannot be read."""
 SKIPPED = "skipped"
-"""Status of an instance that no view shows enough keypoints of: no method was run."""
+"""Status of an instance without a view of enough keypoints: no method was run."""
 
 
 class LeftOutError(CadalignError):
-    """An instance, or a method on it, lacks what is asked for; that is no failure."""
+    """An instance lacks an input of the method, which does not count as a failure."""
 
 
 @dataclass(frozen=True)
 class Outcome:
     """Result of one method on one task.
 
-    ``names`` are the columns that name the row, such as category, model id and method; ``values``
-    those of facts and metrics, as far as they are known. ``status`` is ``ok``, ``failed``,
-    ``left out``, ``skipped`` or one of the experiment's own, ``reason`` why it is not ok.
-    ``seconds`` are not part of a result table, since no two runs agree on them.
+    ``names`` are the cells that identify the row, such as category, model id and method. ``values``
+    are the known facts and metrics. ``status`` is ``ok``, ``failed``, ``left out``, ``skipped`` or
+    specific to the experiment; ``reason`` explains any status but ok. ``seconds`` are not part of
+    the result table, as they are not reproducible.
     """
 
     names: Row
@@ -61,24 +60,24 @@ class Outcome:
 
     @property
     def is_ok(self) -> bool:
-        """True where there are metrics."""
+        """True if there are metrics."""
         return self.status == OK
 
     def row(self) -> Row:
-        """The row of the result table, and its seconds."""
+        """The row of the result table, with its seconds."""
         named = {**self.names, "status": self.status, "reason": self.reason}
         return {**named, **self.values, "seconds": self.seconds}
 
 
 def status_of(error: Exception) -> str:
-    """The status of a row without metrics, by the reason that there are none."""
+    """The status of a row that has an error instead of metrics."""
     if isinstance(error, TooFewVisibleError):
         return SKIPPED
     return LEFT_OUT if isinstance(error, LeftOutError) else FAILED
 
 
 def reason_of(error: Exception) -> str:
-    """An error in one line; errors of other packages with their type's name."""
+    """Format an error in one line, with its type unless it is a CadalignError."""
     if isinstance(error, CadalignError):
         return str(error)
     text = " ".join(str(error).split())
@@ -86,39 +85,39 @@ def reason_of(error: Exception) -> str:
 
 
 class Experiment(Protocol[T_contra]):
-    """Interface by which a run turns tasks into rows, with cells of all three tables."""
+    """Interface of experiments: turns tasks into rows, with the columns of all three tables."""
 
     @property
     def columns(self) -> Columns:
-        """The columns of the result table."""
+        """Columns of the result table."""
 
     @property
     def record_columns(self) -> Columns:
-        """The columns of the table of records, for rows that have the last one; may be empty."""
+        """Columns of the table of records, or none; a row is a record if it has the last one."""
 
     def evaluate(self, tasks: Sequence[T_contra]) -> list[Row]:
-        """The rows of some tasks, in their order."""
+        """Rows of tasks, in their order."""
 
     def failure(self, task: T_contra, reason: str) -> list[Row]:
-        """The rows of a task that could not be evaluated."""
+        """Rows of a task that could not be evaluated."""
 
 
 @dataclass(frozen=True)
 class Plan(Generic[T]):
-    """All that a run needs to be done."""
+    """Plan of a run."""
 
     experiment: Experiment[T]
     tasks: Sequence[T]
-    """In the order of the result table. Sliced, and only as far as chunks are handed out."""
+    """In the order of the result table; sliced on demand, chunk by chunk."""
     config: dict[str, Any]
-    """All that the results depend on, JSON; the run can only go on with the same."""
+    """Everything that the results depend on, as JSON; a run continues only if it is equal."""
     chunk_size: int
-    """Number of tasks that a worker gets at a time. Part of the configuration: another size would
-    cut a half-done run into other chunks."""
+    """Number of tasks per chunk. Part of the configuration, as the files of an interrupted run
+    depend on it."""
 
 
 def fingerprint(*parts: str | bytes | npt.NDArray[Any]) -> str:
-    """Hash for a run's configuration of what it must not go on without, or with another."""
+    """Hash of data, for a run's configuration: a run continues only with equal data."""
     digest = hashlib.sha256()
     for part in parts:
         data = np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else part
@@ -127,16 +126,16 @@ def fingerprint(*parts: str | bytes | npt.NDArray[Any]) -> str:
 
 
 def fingerprint_of_files(paths: Iterable[Path]) -> str:
-    """Hash of names, sizes and times: to read thousands of files would take as long as a run."""
+    """Hash of names, sizes and times of files, as reading them would take too long."""
     lines = []
     for path in paths:
         try:
             status = path.stat()
         except (OSError, ValueError):
-            continue  # whoever reads it says so
+            continue  # its reader raises the error
         lines.append(f"{path.name} {status.st_size} {status.st_mtime_ns}\n")
     return fingerprint(*lines)
 
 
 class AbortError(DataError):
-    """A failure that would repeat with every other instance, such as a full disk."""
+    """A failure that every other instance would repeat, such as a full disk."""

@@ -35,22 +35,23 @@ class SessionOptions:
     model: Path
     """OBJ, PLY, GLB, glTF, STL or OFF file."""
     observation: Path | None = None
-    """Observation file of a single photo, continued if it exists; by default beside the photo."""
+    """Observation file of a single photo, by default beside the photo. An existing file is
+    continued."""
     out: Path | None = None
-    """Folder for the observations; by default the photos'."""
+    """Folder for the observation files; by default the folder of the photos."""
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K as text, or JSON in COLMAP's form. Without one the
-    focal length is estimated."""
+    """Camera calibration file for photos without an observation file: a 3 x 3 matrix K as text, or
+    JSON with COLMAP's fields. Without a camera, the focal length is estimated."""
     focal: float | None = None
-    """Focal length of the photos [px], where no file has it, or in its place."""
+    """Focal length of photos without an observation file [px]; overrides the camera file."""
     keypoints: Path | None = None
-    """The model's keypoints: model.keypoints.json."""
+    """The model's keypoint file; by default model.keypoints.json beside the model."""
     up_axis: Literal["x", "y", "z"] | None = None
-    """The model's axis that points up, for its view and for gravity; by default the observation
-    file's, or y."""
+    """The model's up axis, for its view and for gravity; by default the observation file's axis, or
+    y."""
     shape: Path | None = None
-    """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
-    keypoints that it knows by semantic id or name."""
+    """Shape file of `cadalign shape learn`: estimate the object's own shape within its category.
+    Only keypoints with a semantic id or name of the shape count."""
 
 
 @contextmanager

@@ -42,32 +42,33 @@ class ObservationFit:
     """Settings of an observation's alignment, in the place of those that its file stores."""
 
     sigma: float | Literal["none"] | None = None
-    """Standard deviation of the keypoints [px], by default the file's, or 1; none: estimated from
-    the residuals."""
+    """Standard deviation of the keypoint noise [px], or none to estimate it from the residuals; by
+    default the file's value, or 1."""
     similar: bool = False
-    """For a model that is only similar to the object: sigma is none unless it is given, and
-    proportions are expected within 20 % of the model's, unless the file says otherwise."""
+    """The model is only similar to the object: estimate sigma unless it is given, and expect
+    proportions within 20 % of the model's unless the file has a stretch_sigma."""
     robust: bool = False
-    """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
+    """Find outliers among the keypoints by RANSAC, and fit only the inliers."""
     shape: Path | None = None
-    """File of `cadalign shape learn`: estimate the object's own shape, of that category, in place
-    of a stretch. Keypoints need the shape's semantic ids or names, and no xyz."""
+    """Shape file of `cadalign shape learn`: estimate the object's own shape within its category,
+    instead of a stretch. Keypoints need the shape's semantic ids or names, but no xyz."""
     shape_sigma: float | None = None
-    """Estimate the object's own shape from the model's: standard deviation of the keypoints'
-    positions on the object about those on the stretched model [model units]."""
+    """Estimate the object's own shape as a deviation from the stretched model, with this standard
+    deviation of each keypoint's position [model units]."""
     use_photo: bool = False
-    """Take the photo itself as evidence: the model's outline is sought in it, from the estimate by
-    everything else. The model needs a mesh."""
+    """Use the photo itself as evidence: search it for the model's outline, starting at the estimate
+    from all other evidence. The model needs a mesh."""
     focal: Literal["known", "estimate"] | None = None
-    """Focal length: known (the file's) or estimate; by default known, if every view has one."""
+    """Whether the focal length is known or to be estimated; by default known if all views have
+    one."""
     method: str | None = None
-    """Solver: optimal (maximum likelihood, searched globally; the default), aepnp (linear),
-    aepnp-paper (linear, as published) or epnp (OpenCV's, without stretch)."""
+    """Solver: optimal (maximum likelihood by global search; the default), aepnp (linear),
+    aepnp-paper (linear, as published) or epnp (OpenCV, without stretch)."""
     loss: str | None = None
-    """Loss on the length of a residual: linear (squared; the default), huber or cauchy; the robust
-    ones tolerate outliers."""
+    """Loss on the length of a residual: linear (squared error; the default), or huber or cauchy,
+    which tolerate outliers."""
     stretch: str | None = None
-    """Axes whose scale is estimated: yz by default; y, z or none."""
+    """Axes whose scale is estimated: yz (the default), y, z or none."""
 
     @property
     def given(self) -> dict[str, Any]:

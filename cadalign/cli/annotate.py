@@ -22,19 +22,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Annotate(SessionOptions):
-    """Mark keypoints on photos and a model in the browser, and see the alignment as you go.
+    """Mark keypoints on photos and a model in the browser, with a live alignment.
 
-    Serves a page on this machine only. Every change is saved at once: an observation beside each
-    photo (photo.json), which `cadalign fit` aligns, and the model's keypoints
-    (model.keypoints.json).
+    Serves a page that only this machine can open. Saves every change at once: an observation beside
+    each photo (photo.json), for `cadalign fit`, and the model's keypoints (model.keypoints.json).
     """
 
     image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTO")]
     """A photo, or a folder of photos."""
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """The model, an OBJ, PLY, GLB, glTF, STL or OFF file."""
+    """The model: an OBJ, PLY, GLB, glTF, STL or OFF file."""
     port: int = 0
-    """Port to listen on; 0 for a free one."""
+    """Port of the page; 0 selects a free port."""
     no_open: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the address instead of opening a browser."""
 

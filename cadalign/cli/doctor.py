@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check the renderers, and show how to enable missing ones.
+    """Check the renderers, and show how to enable those that fail.
 
-    Also shows the cache of compiled solvers. With --compile, compiles the solvers ahead.
+    Also shows the cache of compiled solvers.
     """
 
     compile: bool = False
-    """Compile all solvers now, as for a Docker image, in place of when they are first called."""
+    """Compile all solvers now, for example in a Docker image, instead of at their first call."""
 
     def run(self) -> int:
         """Run the checks; returns the exit code, 0 if ray casting works."""

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _COMMAND = "evaluate"
 _EXIT_CODES = (
-    "Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or "
-    "all rows failed, 2 a wrong command line."
+    "Exit codes: 0 all rows succeeded, 3 some rows failed, 1 all rows failed or the run was "
+    "refused or interrupted, 2 wrong command line."
 )
 
 
@@ -100,10 +100,9 @@ class _DemoCommand(RunCommand):
     """The end of a demonstration: a page called index.html, whatever failed."""
 
     out: Path = Path("demo")
-    """Folder to write to."""
+    """Folder for the results and index.html."""
     files: Path | None = None
-    """Write the files of the README's example to this folder, to try commands with, and nothing
-    else."""
+    """Only write the files of the README's example to this folder."""
 
     def run(self) -> int:
         """Run the demonstration; returns the exit code."""
@@ -125,17 +124,17 @@ Demo: Any = command_of(DemoOptions, _DemoCommand)
 
 @dataclass(frozen=True)
 class ReportCommand:
-    """Show the result of one or more runs.
+    """Write a page with the results of one or more runs.
 
-    The page holds the headline table, plots, and a gallery whose instances open with their numbers
-    and in 3D. It needs no network. Several runs of one kind stand beside each other. A
-    run may be unfinished: the page shows what there is.
+    The page holds the main table, plots, and a gallery of instances in 3D. It works without a
+    network. Several runs of one kind are compared side by side. An unfinished run is shown as far
+    as it got.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of runs, as `cadalign demo`, `evaluate` and `simulate` write them."""
+    """Folders of runs that `cadalign demo`, `evaluate`, `simulate`, `fit` or `retrieve` wrote."""
     out: Path | None = None
-    """File to write; by default report.html, in the run's folder if it is one run."""
+    """Page to write; by default report.html, in the run's folder if there is a single run."""
 
     def run(self) -> int:
         """Write the report; returns the exit code."""

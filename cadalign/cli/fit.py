@@ -28,22 +28,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(ManyCommand, ObservationFit, CameraOptions):
-    """Align a model to what an observation file holds, and draw the result.
+    """Align a model to an observation, and draw the result.
 
-    Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
-    known lengths. Prints the alignment and how well each piece of evidence agrees with it. Further
-    options, such as priors, stand in the file. Writes fit.json and overlay.png, overlay_1.png and
-    so on for further views. Many observations, as of several objects of one photo, are a run, which
-    goes on where it was killed: it writes results.parquet and results.csv with a row for each, and
-    report.html. Exit codes of a run: 0 all are aligned, 3 some failed, 1 all failed or refused, 2 a
+    An observation holds keypoints in one or several views, and optionally masks, depth, gravity,
+    the camera's height and known lengths. Further settings, such as priors, are fields of the
+    observation file. Prints the alignment and how well each piece of evidence agrees with it.
+    Writes fit.json and one picture per view: overlay.png, overlay_1.png and so on.
+
+    Several observations are aligned as a run. It writes results.parquet and results.csv, with a row
+    per observation, and report.html. A killed run continues when the same command is started again.
+
+    Exit codes of a run: 0 all aligned, 3 some failed, 1 all failed or the input was refused, 2
     wrong command line.
     """
 
     out: Path | None = None
-    """Folder to write to; by default <observation>_fit beside the file or folder."""
+    """Output folder; by default <observation>_fit beside the observation file or folder."""
     focal: Literal["known", "estimate"] | float | None = None  # type: ignore[assignment]
-    """Focal length [px], in the place of the file's, or: known (the file's) or estimate; by default
-    known, if every view has one. Views of equal cameras share an estimated one."""
+    """Focal length [px]; or known, to use the file's value; or estimate. By default known if every
+    view has a focal length, otherwise estimate. Views with equal cameras share one estimate."""
 
     @property
     def estimate(self) -> ObservationFit:
@@ -121,14 +124,15 @@ def drawn(observation: Observation, result: Result) -> list[ByteImage]:
 class Export:
     """Write a fit for another tool.
 
-    GLB holds the textured model, stretched or warped, the cameras and the photos behind it: it
-    opens in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh.
+    GLB holds the aligned model with its texture, the cameras, and the photos behind the model.
+    Blender, three.js and other viewers show the same scene as the overlay. OBJ and PLY hold only
+    the mesh.
     """
 
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON")]
-    """Result of `cadalign fit`, or its folder."""
+    """The fit.json of `cadalign fit`, or its folder."""
     to: Path
-    """File to write, whose ending tells the format: .glb, .obj, .ply."""
+    """File to write. Its ending sets the format: .glb, .obj or .ply."""
 
     def run(self) -> int:
         """Write the file; returns the exit code."""

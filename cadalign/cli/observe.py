@@ -1,4 +1,4 @@
-"""`cadalign observe`: pair a detector's keypoints with a model's."""
+"""`cadalign observe`: match a detector's keypoints to a model's keypoints."""
 
 from __future__ import annotations
 
@@ -26,29 +26,30 @@ from cadalign.io.observation import Observation
 
 @dataclass(frozen=True)
 class Observe(CameraOptions):
-    """Pair the keypoints of a detector in a photo with a model's.
+    """Match a detector's keypoints to a model's keypoints.
 
-    Writes an observation for `cadalign fit`, which takes a whole file of many objects itself.
-    Keypoints are paired by name, otherwise by semantic id, otherwise by order. Without --camera or
-    --focal the focal length is unknown. The mask that stands beside COCO keypoints is written as
-    PNG beside the observation where the camera and the model's mesh are known, which a fit to it
-    needs.
+    Writes an observation of one object for `cadalign fit`. To align all objects of a detector's
+    file, give that file to `cadalign fit` directly. Keypoints are matched by name, otherwise by
+    semantic id, otherwise by order. Without --camera or --focal the focal length is unknown. The
+    mask of a COCO annotation is written as PNG beside the observation. It needs a known focal
+    length and the model's mesh, and is left out otherwise.
     """
 
     keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
-    """COCO keypoint JSON (MMPose, Detectron2, ultralytics), or CSV with the columns name, u, v."""
+    """The detector's file: COCO keypoint JSON (as from MMPose, Detectron2 or ultralytics), or CSV
+    with the columns name, u, v."""
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """The model: its keypoints, NAME.keypoints.json, or the mesh that these lie beside."""
+    """The model: its NAME.keypoints.json, or the mesh beside that file."""
     image: Path | None = None
-    """The photo; its name selects among the file's images."""
+    """The photo. Its name selects the image in the detector's file."""
     out: Path | None = None
-    """Observation file to write; by default <keypoints>.observation.json beside the keypoints."""
+    """Observation file to write; by default <keypoints>.observation.json beside KEYPOINTS."""
     object: int | None = None
-    """Number of the object in the photo, from 0; by default the one with the highest score."""
+    """Index of the object in the photo, from 0; by default the object with the highest score."""
     min_score: float = 0.0
-    """Least score of a keypoint that is kept."""
+    """Minimum score of a keypoint. Keypoints below it are left out."""
     ignore_unknown: bool = False
-    """Leave out keypoints that the model does not have."""
+    """Leave out keypoints that the model lacks."""
 
     def run(self) -> int:
         """Write the observation; returns the exit code."""

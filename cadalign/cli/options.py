@@ -71,16 +71,16 @@ class ManyCommand(JsonOption, DetectorOptions):
         tyro.conf.Positional,
         tyro.conf.arg(metavar="OBSERVATION ...", help_behavior_hint="(required)"),
     ]
-    """A JSON file with camera and keypoints, optionally image, model and further evidence. Or many:
-    several such files, folders, JSON lines (.jsonl), or a detector's file of keypoints (COCO's
-    JSON, or CSV) with --camera and --model or --shape."""
+    """A JSON file with the camera and keypoints, and optionally the image, the model and further
+    evidence. For a run: several files, folders of files, JSON lines (.jsonl), or a detector's
+    keypoint file (COCO JSON or CSV) with --camera and --model or --shape."""
     picture: bool = True
-    """Draw box and keypoints over the photo, as overlay.png; of many observations, write a page."""
+    """Draw the box and keypoints over the photo (overlay.png); for a run, write report.html."""
     workers: int | None = None
-    """Processes for many observations; -1 for one for each core, 0 for none. By default -1, for few
-    observations 0."""
+    """Number of processes of a run: -1 for one per core, 0 to use none. By default -1, or 0 for
+    fewer than 200 observations."""
     dask: str | None = None
-    """Address of a Dask scheduler, whose workers are used instead."""
+    """Address of a Dask scheduler. Its workers are used instead of local processes."""
 
     @property
     def first(self) -> Path:
@@ -111,10 +111,10 @@ class CameraOptions:
     """The calibrated camera."""
 
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K as text, or JSON in COLMAP's form: model, width,
-    height, params."""
+    """Camera calibration file: a 3 x 3 matrix K as text, or JSON with COLMAP's fields (model,
+    width, height, params)."""
     focal: float | None = None
-    """Focal length [px], where no file has it, or in its place."""
+    """Focal length [px]; overrides the value in the files."""
 
     @property
     def changes(self) -> ObservationChanges:

@@ -22,24 +22,22 @@ _ENDINGS = (".png", JPEG_ENDING)
 
 @dataclass(frozen=True)
 class Render:
-    """Draw a model: a still, or a contact sheet of several views.
-
-    One view gives a still, several give a contact sheet.
-    """
+    """Draw a model: one view, or a contact sheet of several views."""
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """OBJ, PLY, GLB, glTF, STL or OFF file."""
+    """The model: an OBJ, PLY, GLB, glTF, STL or OFF file."""
     out: Path = Path("render.png")
-    """File to write: .png or .jpg."""
+    """Picture to write: .png or .jpg."""
     view: tuple[str, ...] = ("iso",)
-    """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
-    degrees (write --view=-30,20 if it begins with a minus), or all."""
+    """Views to draw: iso, front, right, back, left, top, bottom, all of these (all), or
+    azimuth,elevation[,roll] in degrees. Write --view=-30,20 for a value that begins with a
+    minus."""
     resolution: str = "640x480"
-    """Width and height in pixels; of a contact sheet, each picture's."""
+    """Width and height of each view [px]."""
     keypoints: Path | None = None
-    """Keypoints to draw: the model's NAME.keypoints.json."""
+    """Keypoint file to draw: the model's NAME.keypoints.json."""
     fov: float = 35.0
-    """Horizontal field of view in degrees."""
+    """Horizontal field of view [degrees]."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""

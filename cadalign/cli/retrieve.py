@@ -1,4 +1,4 @@
-"""`cadalign retrieve`: rank a library's models by an image's keypoints; `library`: build one."""
+"""`cadalign retrieve`: rank a library's models by an image's keypoints; `cadalign library`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _RetrievalOptions(RetrievalOptions):
-    """Ranking of the models; the observation file supplies the standard deviation."""
+    """Ranking of the models."""
 
     sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
 
@@ -45,21 +45,22 @@ class _RetrievalOptions(RetrievalOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
-    """Find the models of a library that explain an image's keypoints best.
+    """Find the models of a library that best explain an image's keypoints.
 
-    Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
-    keypoints need a semantic_id, or the name that the library has for it, and no xyz. A detector's
-    file needs no --model. With --out, writes matches.json, an overlay of each
-    match and its observation, and matches.png, which shows them side by side.
-    Many observations are a run, as of `cadalign fit`: it writes results.parquet and results.csv
-    with a row for each, and report.html.
+    Estimates pose and stretch of each model. The observation is a file as for `cadalign fit`. Its
+    keypoints need a semantic_id or a name that the library knows, but no xyz; a detector's file
+    needs no --model. With --out, writes matches.json, an overlay and an observation of each match,
+    and matches.png with all overlays side by side.
+
+    Several observations are a run, as with `cadalign fit`. It writes results.parquet and
+    results.csv, with a row per observation, and report.html.
     """
 
     out: Path | None = None
-    """Folder for matches.json and the matches' pictures; by default none is written. For many
-    observations the run's, by default beside them."""
+    """Output folder for matches.json and the pictures; by default nothing is written. For a run,
+    the folder of the run; by default beside the observations."""
     picture: bool = True
-    """Write a page of many observations."""
+    """For a run, write report.html."""
     ranking: Annotated[
         _RetrievalOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RetrievalOptions.__doc__)
     ] = _RetrievalOptions()
@@ -134,11 +135,11 @@ def _print_table(matches: Sequence[Match]) -> None:
 
 @dataclass(frozen=True)
 class LibraryBuild:
-    """Build a library of own models, or of a data set's annotated ones, as one file."""
+    """Build a library file from your own models, or from the models of a data set."""
 
     root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-    """Folder of meshes with their NAME.keypoints.json, whose subfolders are categories; or one in
-    KeypointNet's layout."""
+    """Folder with a subfolder per category that holds meshes and their NAME.keypoints.json; or the
+    folder of a data set in KeypointNet's layout."""
     out: Path = Path("library.cadalign")
     """File to write."""
     categories: tuple[str, ...] | None = None
@@ -146,7 +147,7 @@ class LibraryBuild:
     split: str | None = None
     """Split of the data set to include, such as train; all models by default."""
     shapenet: Path | None = None
-    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
+    """ShapeNetCore folder with the meshes, if they are not inside FOLDER."""
 
     def run(self) -> int:
         """Build the library; returns the exit code."""
@@ -189,7 +190,7 @@ class LibraryShow:
     """Check a library file and list its models by category."""
 
     library: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LIBRARY")]
-    """File that `cadalign library build` wrote."""
+    """Library file of `cadalign library build`."""
 
     def run(self) -> int:
         """Open the library and describe it; returns the exit code."""

@@ -22,20 +22,20 @@ _MODES = 5  # whose share of the variance is listed
 
 @dataclass(frozen=True)
 class ShapeLearn:
-    """Learn the shapes of a category from a data set's annotated models, as one file."""
+    """Learn the shape model of a category from a data set's annotated models."""
 
     root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
-    """Folder in KeypointNet's layout."""
+    """Folder of a data set in KeypointNet's layout."""
     category: str
     """Category to learn, such as chair."""
     out: Path | None = None
-    """File to write; by default <category>.shape."""
+    """Shape file to write; by default <category>.shape."""
     split: str | None = None
     """Split of the data set to learn from, such as train; all models by default."""
     shapenet: Path | None = None
-    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
+    """ShapeNetCore folder with the meshes, if they are not inside ROOT."""
     components: int | None = None
-    """Number of Gaussians; chosen by the likelihood of held-out models by default."""
+    """Number of Gaussian components; by default chosen by the likelihood of held-out models."""
 
     def run(self) -> int:
         """Learn the model; returns the exit code."""
@@ -61,10 +61,10 @@ class ShapeLearn:
 
 @dataclass(frozen=True)
 class ShapeShow:
-    """Describe a shape model."""
+    """Describe the shape model of a file."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
-    """File that `cadalign shape learn` wrote."""
+    """Shape file of `cadalign shape learn`."""
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
@@ -93,5 +93,5 @@ def _text(model: ShapeModel) -> str:
 
 
 ShapeCommand = group_of(
-    "Learn and inspect the shapes of categories.", {"learn": ShapeLearn, "show": ShapeShow}
+    "Learn and inspect shape models of categories.", {"learn": ShapeLearn, "show": ShapeShow}
 )

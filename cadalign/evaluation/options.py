@@ -34,7 +34,7 @@ class ExperimentOptions:
     """Command that runs it."""
 
     seed: int = 0
-    """Seed of everything random."""
+    """Seed of the random numbers."""
 
     def __post_init__(self) -> None:
         self.check_least(seed=0)
@@ -136,7 +136,7 @@ class FunctionOptions(ExperimentOptions):
     """
 
     metrics: tuple[str, ...] = ()
-    """Metrics of one's own, beside the experiment's: module:function."""
+    """Additional metrics of your own, each as module:function."""
 
     def check_methods(self, own: tuple[str, ...] | None = None) -> None:
         """Check methods, each once; ``own`` are the names of the experiment's, if it has any."""
@@ -150,14 +150,14 @@ class ModelOptions(ExperimentOptions):
     """Choice of the models of a dataset."""
 
     root: Annotated[Path, tyro.conf.Positional]
-    """Folder in KeypointNet's layout."""
+    """Folder of a data set in KeypointNet's layout."""
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
+    """Categories to use; all by default."""
     max_models: int | None = None
-    """Largest number of models of each category."""
+    """Maximum number of models per category; all by default."""
     shapenet: Path | None = None
-    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
+    """ShapeNetCore folder with the meshes, if they are not inside PATH."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -170,9 +170,9 @@ class ViewOptions(ModelOptions, FunctionOptions):
 
     _: KW_ONLY
     noise_px: float = 1.0
-    """Standard deviation of the keypoints' noise, in pixels."""
+    """Standard deviation of the keypoint noise [px]."""
     views_per_model: int = 1
-    """Number of views of each model, an instance each."""
+    """Number of views per model. Each view is an instance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -190,11 +190,11 @@ class RunOptions:
     """Place and workers of a run; its results do not depend on them."""
 
     out: Path | None = None
-    """The run's folder; one in runs/, named after the experiment, by default."""
+    """Output folder; by default runs/ and the name of the experiment."""
     workers: int | None = None
-    """Processes; -1 for one for each core (the default), 0 for none."""
+    """Number of processes: -1 for one per core (the default), 0 to use none."""
     dask: str | None = None
-    """Address of a Dask scheduler, whose workers are used instead."""
+    """Address of a Dask scheduler. Its workers are used instead of local processes."""
 
 
 def absolute_paths(value: T) -> T:

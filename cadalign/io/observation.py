@@ -296,15 +296,15 @@ class DetectorOptions:
     """Complements of a detector's file of keypoints, and which of its keypoints count."""
 
     model: Path | None = None
-    """The model, whose keypoints those of a detector's file are paired with, by name, otherwise by
-    semantic id, otherwise by order: NAME.keypoints.json, or the mesh that this lies beside. With
-    --shape, the shape's by default."""
+    """The model of a detector's file: its NAME.keypoints.json, or the mesh beside that file.
+    Keypoints are matched by name, otherwise by semantic id, otherwise by order. With --shape, the
+    shape's keypoints by default."""
     images: Path | None = None
-    """Folder of the photos that a detector's file names."""
+    """Folder of the photos of a detector's file; by default the folder of that file."""
     min_score: float = 0.0
-    """Least score of a detector's keypoint that is kept."""
+    """Minimum score of a detector's keypoint. Keypoints below it are left out."""
     ignore_unknown: bool = False
-    """Leave out a detector's keypoints that the model does not have."""
+    """Leave out a detector's keypoints that the model lacks."""
 
 
 @once_per_file(64)  # which many observations may name

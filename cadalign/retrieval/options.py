@@ -48,20 +48,19 @@ class RetrievalOptions:
     """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
     keypoint."""
     loss: str = "linear"
-    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
+    """Loss on the length of a whitened residual: linear (squared error), or huber or cauchy, which
     tolerate outliers."""
     loss_scale: float = 2.0
-    """Length at which a robust loss begins to bend [sigma]."""
+    """Residual length at which huber or cauchy departs from the squared error [sigma]."""
     stretch: str | None = None
-    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
-    "none"."""
+    """Axes whose scale is estimated: yz (the default), y, z or none."""
     top: int = 10
-    """Largest number of matches to return."""
+    """Maximum number of matches."""
     category: str | None = None
-    """Name or synset id of the only category to compare with; by default all."""
+    """Search only this category (name or synset id); by default all."""
     shape_sigma: float = 0.0
-    """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
-    in the image: above 0, say 0.03, for libraries with only similar models."""
+    """Typical distance of the model's keypoints from the object's, as a share of the keypoints'
+    extent in the image. Give about 0.03 if the library has only similar models."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.top, int) or self.top < 1:

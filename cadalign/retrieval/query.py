@@ -26,12 +26,12 @@ class ObservationRetrieval:
     """Settings of the retrieval of an observation's model."""
 
     library: Path
-    """File that `cadalign library build` wrote."""
+    """Library file of `cadalign library build`."""
     shape: Path | None = None
-    """File that `cadalign shape learn` wrote: ranks its category's models by the shape estimated
-    from the keypoints, for objects that are not in the library."""
+    """Shape file of `cadalign shape learn`, for objects that are not in the library: ranks its
+    category's models by the shape estimated from the keypoints."""
     sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    """Standard deviation of the keypoint noise [px]; by default the file's value, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
 
     def opened(self) -> tuple[Library, ShapeModel | None]:

@@ -52,22 +52,22 @@ _SEARCH = RansacOptions(max_reproj_error=4.0, max_iterations=10_000)
 class CorrespondenceOptions(FunctionOptions):
     """Evaluate methods on real correspondences with outliers.
 
-    For every image, share of outliers and draw, the scene is stretched by factors from 0.5 to 2
-    along y and z, and the share of the image points is moved to anywhere in the image; all methods
-    get the same input. The run's folder gets results.parquet with a row per input and method,
-    summary.csv, figures and report.html. A killed run continues when the same command is
-    started again. Times are best measured with --workers 1.
+    For each image, share of outliers and draw, stretches the scene by factors from 0.5 to 2 along y
+    and z, and moves that share of the image points to random places in the image. All methods get
+    the same input. Writes results.parquet with a row per input and method, summary.csv, figures and
+    report.html. A killed run continues when the same command is started again. Measure times with
+    --workers 1.
     """
 
     experiment = "correspondences"
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a COLMAP model, or of a blind-PnP data set's split."""
+    """Folder of a COLMAP model, or of a split of a blind-PnP data set."""
     _: KW_ONLY
     outliers: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-    """Shares of the image points that are moved, from 0 to less than 1."""
+    """Shares of outliers among the image points, from 0 to less than 1."""
     draws: int = 20
-    """Number of draws of scales and outliers for every image and share."""
+    """Number of random draws of scales and outliers per image and share."""
     methods: tuple[str, ...] = (
         "epnp",
         "aepnp-paper",
@@ -75,9 +75,9 @@ class CorrespondenceOptions(FunctionOptions):
         "ransac-aepnp-refined",
         "ransac-optimal",
     )
-    """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, and those that search for inliers:
-    ransac-optimal, ransac-ap4p, and the paper's two steps, ransac-aepnp and ransac-aepnp-refined.
-    The others get all points."""
+    """Methods to compare: those of `cadalign fit`, optimal-huber and optimal-cauchy on all points;
+    with RANSAC ransac-optimal, ransac-ap4p, and the paper's two steps, ransac-aepnp and
+    ransac-aepnp-refined."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

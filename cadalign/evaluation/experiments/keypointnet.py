@@ -50,27 +50,27 @@ if TYPE_CHECKING:
 class KeypointNetOptions(ViewOptions):
     """Evaluate methods on views of KeypointNet's models.
 
-    Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
-    stretched by factors from 0.5 to 2 along y and z. The run's folder gets results.parquet with a
-    row per model, view and method, summary.csv, figures, report.html and, if asked for, pictures.
-    A killed run continues when the same command is started again.
+    Each view shows the original model. Methods get its visible keypoints with noise, and the model
+    stretched by factors from 0.5 to 2 along y and z. Writes results.parquet with a row per model,
+    view and method, summary.csv, figures, report.html and, with --render overlay, pictures. A
+    killed run continues when the same command is started again.
     """
 
     experiment = "keypointnet"
 
     _: KW_ONLY
     split: str | None = None
-    """The dataset's split to take, such as test; all models by default."""
+    """Split of the data set to use, such as test; all models by default."""
     min_visible: int = 6
-    """Least number of keypoints that a view must show; of several views, the first."""
+    """Minimum number of visible keypoints in the first view of a model."""
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
-    """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
-    ransac-aepnp, and limit: the Cramer-Rao bound."""
+    """Methods to compare: those of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal,
+    ransac-ap4p, ransac-aepnp, and limit (the Cramer-Rao bound)."""
     visibility: Literal["auto", "hull"] = "auto"
-    """Keypoints are seen that rays cast at the mesh reach, where there is one, or, everywhere by
-    hull, by a rule on the hull of the keypoints."""
+    """Test of a keypoint's visibility: auto casts rays at the mesh, or uses the keypoints' convex
+    hull if there is no mesh; hull always uses the convex hull."""
     render: Literal["none", "overlay"] = "none"
-    """Draw the first method's result for every model with a mesh, or nothing."""
+    """overlay draws the first method's result for every model with a mesh; none draws nothing."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -299,23 +299,23 @@ _LEAST_SAMPLE = 12  # models of each category of a sample dataset
 
 @dataclass(frozen=True)
 class DemoOptions(ExperimentOptions):
-    """Align stretched models to pictures of the originals and show the result.
+    """Align stretched models to pictures of the originals, and show the result.
 
-    For each model: choose a view, render it, stretch the model by factors from 0.5 to 2 along y
-    and z, add 1 px of noise to its visible keypoints, fit, and draw true (green) and predicted
-    (red) box. Writes results.parquet and index.html.
+    Renders a random view of each model, adds 1 px of noise to its visible keypoints, stretches the
+    model by factors from 0.5 to 2 along y and z, aligns it, and draws the true box (green) and the
+    estimated box (red). Writes results.parquet and index.html.
     """
 
     experiment = "demo"
     command = "demo"
 
     root: Path | None = None
-    """Folder of a dataset in KeypointNet's layout; by default a sample dataset is generated."""
+    """Folder of a data set in KeypointNet's layout; by default a sample data set is generated."""
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
+    """Categories to use; all by default."""
     per_category: int = 6
-    """Largest number of models of each category."""
+    """Maximum number of models per category."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

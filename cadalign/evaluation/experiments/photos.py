@@ -57,28 +57,28 @@ EVIDENCE = (MASK, GRAVITY, IMAGE)
 class PhotosOptions(FunctionOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
-    The folder may hold Scan2CAD, PASCAL3D+ or Pix3D. Keypoints are the annotated ones. The model's
-    width (x) is given, as one image leaves size open. The run's folder gets results.parquet with a
-    row per object and method, summary.csv, figures and report.html. A killed run continues when the
+    The data set is Scan2CAD, PASCAL3D+ or Pix3D. Methods get the annotated keypoints, and the
+    model's width (x), since one image does not determine size. Writes results.parquet with a row
+    per object and method, summary.csv, figures and report.html. A killed run continues when the
     same command is started again.
     """
 
     experiment = "photos"
 
     root: Annotated[Path, tyro.conf.Positional]
-    """Folder of the data set, in any of the known formats."""
+    """Folder of the data set."""
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
+    """Categories to use; all by default."""
     methods: tuple[str, ...] = BASES
-    """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
-    keypoints that differ from the model's by 4 % of its diagonal); each but epnp also with
-    evidence, as in rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and
-    truth."""
+    """Methods to compare: epnp, rigid, stretched, prior (stretched, with a prior on the scales),
+    similar (prior, with keypoints that differ from the model's by 4 % of its diagonal) and truth.
+    All but epnp and truth can have evidence added: rigid+mask, rigid+image (the photo itself),
+    similar+mask+gravity."""
     max_photos: int | None = None
-    """Number of photos to take, the first ones; all by default."""
+    """Number of photos to use, from the first; all by default."""
     pictures: int = 100
-    """Number of photos whose pictures the report shows, the first ones."""
+    """Number of photos to show in the report, from the first."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

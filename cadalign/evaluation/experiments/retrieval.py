@@ -67,22 +67,21 @@ METHOD = "optimal"
 class RetrievalRunOptions(ModelOptions):
     """Evaluate the retrieval of CAD models.
 
-    Each model is stretched by factors from 0.5 to 2 along y and z and seen from a random view; some
-    of its visible keypoints, with noise, are looked up in a library that holds the model
-    (leave-in), and in one that doesn't (leave-out). The run's folder gets results.parquet with a
-    row per query and protocol, summary.csv, figures and the library. Killed, it goes on where it
-    was when the same command is started again.
+    Stretches each model by factors from 0.5 to 2 along y and z, draws a random view, and searches
+    some of its visible keypoints, with noise, in a library with the model (leave-in) and without it
+    (leave-out). Writes results.parquet with a row per query and protocol, summary.csv, figures and
+    the library. A killed run continues when the same command is started again.
     """
 
     experiment = "retrieval"
 
     root: Annotated[Path, tyro.conf.Positional]
-    """Folder in KeypointNet's layout, or a library's file."""
+    """Folder of a data set in KeypointNet's layout, or a library file."""
     _: KW_ONLY
     noise_px: float = 1.0
-    """Standard deviation of the keypoints' noise, in pixels."""
+    """Standard deviation of the keypoint noise [px]."""
     keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
-    """Numbers of visible keypoints that are given."""
+    """Numbers of visible keypoints per query."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

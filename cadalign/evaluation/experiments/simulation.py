@@ -83,16 +83,16 @@ class SweepOptions(FunctionOptions):
     command = "simulate"
 
     sweep: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP")]
-    """The quantity that is varied: noise, at 1,024 points; points, at 2 px of noise; or outliers,
-    at 100 points and 2 px."""
+    """Quantity to vary: noise (at 1,024 points), points (at 2 px of noise) or outliers (at 100
+    points and 2 px of noise)."""
     _: KW_ONLY
     methods: tuple[str, ...] | None = None
-    """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
-    ransac-aepnp, and limit: the Cramer-Rao bound. The sweep's own by default."""
+    """Methods to compare: those of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal,
+    ransac-ap4p, ransac-aepnp, and limit (the Cramer-Rao bound). The default depends on SWEEP."""
     values: tuple[float, ...] | None = None
-    """Values of the quantity that is varied, instead of the sweep's own."""
+    """Values of the varied quantity; by default a range for each SWEEP."""
     runs: int | None = None
-    """Problems for each value."""
+    """Number of problems per value; by default 2000, or 500 for outliers."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -43,13 +43,12 @@ METHODS = ("mean-rigid", "mean-stretched", SHAPE, "exact", LIMIT)
 
 @dataclass(frozen=True)
 class UnseenOptions(ViewOptions):
-    """Evaluate alignment to objects that are no stretched copy of any model.
+    """Evaluate alignment to objects whose own model is not known.
 
-    Objects of one split of KeypointNet are aligned with what is learned of their category from
-    the models of the other split: the mean shape, or the shape model; and, for comparison, with the
-    object's own model. The run's folder gets results.parquet with a row per object, view and
-    method, summary.csv, figures, report.html and the learned shapes. A killed run continues when
-    the same command is started again.
+    Aligns the objects of one split of KeypointNet with the mean shape or the shape model of their
+    category, learned from another split, and for comparison with the object's own model. Writes
+    results.parquet with a row per object, view and method, summary.csv, figures, report.html and
+    the learned shapes. A killed run continues when the same command is started again.
     """
 
     experiment = "unseen"
@@ -57,16 +56,17 @@ class UnseenOptions(ViewOptions):
 
     _: KW_ONLY
     split: str = "val"
-    """Split of the objects."""
+    """Split of the data set with the objects to align."""
     train: str = "train"
-    """Split of the models to learn from."""
+    """Split of the data set with the models to learn from."""
     noise_px: float = 2.0
-    """Standard deviation of the keypoints' noise, in pixels."""
+    """Standard deviation of the keypoint noise [px]."""
     keypoints: int | None = None
-    """Number of keypoints that are given, drawn at random; all by default."""
+    """Number of keypoints per view, drawn at random; all by default."""
     methods: tuple[str, ...] = METHODS
-    """mean-rigid, mean-stretched: the category's mean; shape: its shape model; exact: the object's
-    own model, stretched; limit: the Cramer-Rao bound of the latter."""
+    """Methods to compare: mean-rigid and mean-stretched (mean shape of the category), shape (shape
+    model of the category), exact (the object's own model, stretched) and limit (the Cramer-Rao
+    bound of exact)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

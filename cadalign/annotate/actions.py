@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import msgspec
 import numpy as np
 
-from cadalign.annotate.photos import MarkedMask, cut_out
+from cadalign.annotate.photos import ObjectMask, segment_box
 from cadalign.annotate.session import Annotation, Session
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera import Camera
@@ -169,8 +169,8 @@ def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
 
 def mask_cut(state: Annotation, *, corners: tuple[Point2, Point2]) -> None:
     """Add what GrabCut finds in a box to the mask."""
-    found = cut_out(read_photo(state.photo.path), np.array(corners, dtype=float))
-    state.record(replace(state.marks, mask=MarkedMask.of(found | state.mask)))
+    found = segment_box(read_photo(state.photo.path), np.array(corners, dtype=float))
+    state.record(replace(state.marks, mask=ObjectMask.from_pixels(found | state.mask)))
 
 
 def mask_clear(state: Annotation) -> None:

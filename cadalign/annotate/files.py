@@ -55,7 +55,7 @@ class SessionOptions:
 
 
 @contextmanager
-def only_annotator(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Keep other annotators off a folder; a killed process holds no lock. Raises DataError."""
     what = "another annotator has this folder open"
     with locked(folder / _LOCK, what, fix=f"go on in its page or end it, or {_OTHER_FOLDER}"):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.annotate.photos import MarkedMask
+from cadalign.annotate.photos import ObjectMask
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
@@ -55,7 +55,7 @@ class Marks:
     camera: Camera
     pairs: tuple[Pair, ...] = ()
     next_number: int = 1
-    mask: MarkedMask | None = None
+    mask: ObjectMask | None = None
     photo: bool = False
     start: Alignment | None = None
 
@@ -85,30 +85,30 @@ class Marks:
 
         If none lacks it, a new pair is begun. The second value is the pair's number.
         """
-        pair = self._lacking("uv", preferred)
-        return self._with(replace(pair, uv=uv)), pair.number
+        pair = self._incomplete_pair("uv", preferred)
+        return self._replace_pair(replace(pair, uv=uv)), pair.number
 
     def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Marks, int]:
         """Place the model half of a pair, as `place_uv`; it must not be placed already."""
         self._refuse_second(keypoint)
-        pair = self._lacking("keypoint", preferred)
-        return self._with(replace(pair, keypoint=keypoint)), pair.number
+        pair = self._incomplete_pair("keypoint", preferred)
+        return self._replace_pair(replace(pair, keypoint=keypoint)), pair.number
 
     def move(self, number: int, uv: Pixel) -> Marks:
         """Move the photo half of a pair."""
-        return self._with(replace(self.pair(number), uv=uv))
+        return self._replace_pair(replace(self.pair(number), uv=uv))
 
     def release_keypoint(self, number: int) -> Marks:
         """Remove the model half of a pair, so that another can be placed."""
         pair = self.pair(number)
         if pair.uv is None:
             return self.delete(number)
-        return self._with(replace(pair, keypoint=None))
+        return self._replace_pair(replace(pair, keypoint=None))
 
     def exchange_keypoint(self, number: int, keypoint: int) -> Marks:
         """Replace the model half of a pair, of which it keeps the photo half."""
         self._refuse_second(keypoint)
-        return self._with(replace(self.pair(number), keypoint=keypoint))
+        return self._replace_pair(replace(self.pair(number), keypoint=keypoint))
 
     def delete(self, number: int) -> Marks:
         """Delete a pair."""
@@ -124,13 +124,13 @@ class Marks:
                     fix="move or delete that pair: a keypoint occurs once in a photo",
                 )
 
-    def _lacking(self, half: str, preferred: int | None) -> Pair:
+    def _incomplete_pair(self, half: str, preferred: int | None) -> Pair:
         """The preferred pair if it lacks this half, otherwise the first that does, or a new one."""
         lacking = [pair for pair in self.pairs if getattr(pair, half) is None]
         wanted = [pair for pair in lacking if pair.number == preferred]
         return (wanted + lacking + [Pair(self.next_number)])[0]
 
-    def _with(self, changed: Pair) -> Marks:
+    def _replace_pair(self, changed: Pair) -> Marks:
         if changed.number == self.next_number:
             return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
@@ -175,14 +175,14 @@ class KeypointRegistry:
     """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
 
     New points don't get ids that are ``reserved``. Points at most ``tolerance`` apart count as one
-    [model units]. The attribute ``given`` holds the ids of those that were read from files.
+    [model units]. The attribute ``file_ids`` holds the ids of those that were read from files.
     """
 
     def __init__(self, *, reserved: Iterable[int] = (), tolerance: float = 0.0) -> None:
         self._tolerance = tolerance
         self._points: dict[int, ModelKeypoint] = {}
         self._last_reserved = max(reserved, default=0)
-        self.given = frozenset[int]()
+        self.file_ids = frozenset[int]()
 
     def __getitem__(self, semantic_id: int) -> ModelKeypoint:
         try:
@@ -216,7 +216,7 @@ class KeypointRegistry:
                     del self._points[number]  # or its own name would be taken
                 else:
                     point = replace(point, semantic_id=None)
-            self.given |= {self.add(point)}
+            self.file_ids |= {self.add(point)}
 
     def has(self, point: ModelKeypoint) -> bool:
         """True if the keypoint of the point's id lies where the point does."""
@@ -302,7 +302,7 @@ class ObjectShape:
         label: KeypointId | None = point.name if self.is_named else point.semantic_id
         return label if label in self.ids else None
 
-    def known(self, points: Sequence[ModelKeypoint]) -> BoolArray:
+    def knows(self, points: Sequence[ModelKeypoint]) -> BoolArray:
         """The points (n,) of which pairs count."""
         return np.array([self.id_of(point) is not None for point in points], dtype=bool)
 

@@ -49,7 +49,7 @@ class Wireframe:
     _piece: float  # length of a line [model units]
 
     @classmethod
-    def of_scene(cls, scene: Scene) -> Wireframe:
+    def from_scene(cls, scene: Scene) -> Wireframe:
         """The lines of a model as it is."""
         small = simplify(scene.mesh, max_faces=_MOST_DRAWN)
         # Faces of real models seldom share vertices: weld those in one place.
@@ -70,19 +70,19 @@ class Wireframe:
         """The lines that always show, (k, 2, 3) float [model units]."""
         return self._mesh.vertices[self._creases]
 
-    def warped(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Wireframe:
+    def warp(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Wireframe:
         """The lines, warped by `cadalign.shapes.warp.warp_mesh`; the simplified mesh hides them."""
         warped = warp_mesh(self._mesh, source, target, bounds=bounds)
         return replace(self, scene=Scene(warped), _mesh=warped)
 
-    def seen_in(self, camera: Camera, alignment: Alignment) -> FloatArray:
+    def project(self, camera: Camera, alignment: Alignment) -> FloatArray:
         """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""
         vertices = self._mesh.vertices
         eye = alignment.inverse(np.zeros((1, 3)))[0]
         ends = vertices[self._smooth]
         outline = ends[_is_outline(ends, vertices[self._beside], eye)]
         lines = np.concatenate([vertices[self._creases], outline])
-        lines = _cut(lines, self._piece)[:_MOST_LINES]
+        lines = _split_lines(lines, self._piece)[:_MOST_LINES]
         if not len(lines):
             return np.empty((0, 2, 2))
         seen = visible_keypoints(self.scene, lines.mean(axis=1), camera, alignment)
@@ -122,7 +122,7 @@ def _is_outline(ends: FloatArray, beside: FloatArray, eye: FloatArray) -> BoolAr
     return np.asarray(sides[:, 0] * sides[:, 1] > 0)
 
 
-def _cut(lines: FloatArray, piece: float) -> FloatArray:
+def _split_lines(lines: FloatArray, piece: float) -> FloatArray:
     if not len(lines):
         return lines
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
@@ -149,7 +149,7 @@ class ClickableModel:
     @cached_property
     def wireframe(self) -> Wireframe:
         """The lines of the model."""
-        return Wireframe.of_scene(self.scene)
+        return Wireframe.from_scene(self.scene)
 
     def to_display(self, xyz: npt.ArrayLike) -> FloatArray:
         """Turn model coordinates (..., 3) into the page's: centred, with a diagonal of 1."""
@@ -198,7 +198,7 @@ class ClickableModel:
 
 
 @dataclass(eq=False)
-class OpenedModel:
+class AnnotatedModel:
     """A model that can be clicked on, its keypoints, and the file they are written to."""
 
     path: Path
@@ -215,14 +215,14 @@ class OpenedModel:
         """Write the given keypoints and those in use; raises DataError on failure."""
         registry = self.registry
         self.content.refuse_changed(self.keypoints_path)
-        kept = (point for number, point in registry if number in registry.given | used)
+        kept = (point for number, point in registry if number in registry.file_ids | used)
         ModelKeypoints(tuple(kept), self.path).save(self.keypoints_path)
         self.content.note(self.keypoints_path)
 
 
 def open_model(
     path: Path, folder: Path, *, keypoints: Path | None = None, shape: ObjectShape
-) -> OpenedModel:
+) -> AnnotatedModel:
     """Open a model, whose keypoints are written into a folder.
 
     ``keypoints`` are those given with it, where they are not beside it. New ones don't get the ids
@@ -240,4 +240,4 @@ def open_model(
             if source == own:
                 refuse_other_model(read.model, path, where=own)
             registry.merge(read.keypoints)
-    return OpenedModel(path, cad, registry, own, content)
+    return AnnotatedModel(path, cad, registry, own, content)

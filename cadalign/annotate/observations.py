@@ -19,8 +19,8 @@ import numpy as np
 
 from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
 from cadalign.annotate.marks import KeypointRegistry, Marks, ObjectShape, Pair, positions_of
-from cadalign.annotate.model import OpenedModel
-from cadalign.annotate.photos import MarkedMask, PhotoFile, camera_of
+from cadalign.annotate.model import AnnotatedModel
+from cadalign.annotate.photos import ObjectMask, PhotoFile, camera_of
 from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
@@ -65,12 +65,12 @@ class ObservationFile:
 
     path: Path
     photo: PhotoFile
-    model: OpenedModel
+    model: AnnotatedModel
     shape: ObjectShape
     stored: Observation = field(init=False)
     """Content of the file when it was opened, of which marks take the place."""
     _content: LastContent = field(default_factory=LastContent, repr=False)
-    _drawn: tuple[MarkedMask, Path] | None = None  # the mask that was written last, and its file
+    _drawn: tuple[ObjectMask, Path] | None = None  # the mask that was written last, and its file
 
     def read(self, given: Camera | None, *, up_axis: Any = None) -> Marks:
         """Read an earlier session's marks, and add new model points to the registry.
@@ -96,12 +96,12 @@ class ObservationFile:
         mask = stored.evidence.mask
         marks = Marks(
             camera_of(self.photo, stored.camera),
-            mask=None if mask is None else MarkedMask(mask, stored.evidence.mask_sigma),
+            mask=None if mask is None else ObjectMask(mask, stored.evidence.mask_sigma),
             photo=bool(stored.fit_options.get("image")),
             start=stored.init,
         )
-        marks = _with_pairs(marks, stored, self.model.registry)
-        return _with_halves(marks, unfinished.pairs, self.model.registry)
+        marks = _add_pairs(marks, stored, self.model.registry)
+        return _add_halves(marks, unfinished.pairs, self.model.registry)
 
     def write(self, observation: Observation) -> None:
         """Write the observation as a whole; raises DataError on failure.
@@ -126,13 +126,13 @@ class ObservationFile:
             return None
         return self.stored.fit_options.get("stretch_sigma") or LIKELY_STRETCH
 
-    def counting(self, marks: Marks) -> tuple[Pair, ...]:
+    def usable_pairs(self, marks: Marks) -> tuple[Pair, ...]:
         """Complete pairs that a fit uses: those whose keypoints the shape knows.
 
         Few count beside a mask only where a start is known: the mask alone aligns until then.
         """
         pairs = marks.complete_pairs
-        known = self.shape.known(self.model.points_of(pairs))
+        known = self.shape.knows(self.model.points_of(pairs))
         counting = tuple(pair for pair, counts in zip(pairs, known, strict=True) if counts)
         by_mask = marks.mask is not None and marks.start is None and self.shape.learned is None
         return () if by_mask and len(counting) < LEAST_JOINT_PAIRS else counting
@@ -144,7 +144,7 @@ class ObservationFile:
 
         ``sigma`` is the option for the noise that the pairs show.
         """
-        pairs = self.counting(marks)
+        pairs = self.usable_pairs(marks)
         points = self.model.points_of(pairs)
         options = {**(sigma or {})}
         if self.stretch_sigma is not None:
@@ -167,10 +167,10 @@ class ObservationFile:
             points_3d=positions_of(points),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=marks.camera,
-            sigma=_filled(pair.sigma for pair in pairs),
+            sigma=_fill_missing(pair.sigma for pair in pairs),
             ids=np.array([point.semantic_id for point in points], dtype=np.int64),
             names=tuple(point.name for point in points),
-            scores=_filled(pair.score for pair in pairs),
+            scores=_fill_missing(pair.score for pair in pairs),
             image=self.photo.path,
             depths=depths if has_depths else None,
             evidence=evidence,
@@ -230,7 +230,7 @@ class ObservationFile:
             )
 
 
-def _filled(values: Iterable[float | None]) -> FloatArray | None:
+def _fill_missing(values: Iterable[float | None]) -> FloatArray | None:
     """The values (n,), 1 where one is missing; None if all are missing."""
     listed = list(values)
     if all(value is None for value in listed):
@@ -238,13 +238,13 @@ def _filled(values: Iterable[float | None]) -> FloatArray | None:
     return np.array([1.0 if value is None else value for value in listed])
 
 
-def _with_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistry) -> Marks:
+def _add_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistry) -> Marks:
     """The marks with unfinished pairs, of which some are of no use any more."""
     for half in halves:
         keypoint = half.semantic_id
         if half.xyz is not None:
             point = ModelKeypoint(half.name or "", half.xyz, keypoint)
-            keypoint = _registered(point, registry, marks.keypoints)
+            keypoint = _register(point, registry, marks.keypoints)
         elif keypoint not in registry or keypoint in marks.keypoints:
             keypoint = None
         if half.uv is not None or keypoint is not None:
@@ -253,13 +253,13 @@ def _with_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegist
     return marks
 
 
-def _with_pairs(marks: Marks, observation: Observation, registry: KeypointRegistry) -> Marks:
+def _add_pairs(marks: Marks, observation: Observation, registry: KeypointRegistry) -> Marks:
     ids, names = observation.ids, observation.names
     columns = (observation.sigma, observation.scores, observation.depths)
     for row, (x, y, z) in enumerate(observation.points_3d.tolist()):
         number = None if ids is None else int(ids[row])
         point = ModelKeypoint("" if names is None else names[row], (x, y, z), number)
-        keypoint = _registered(point, registry, marks.keypoints)
+        keypoint = _register(point, registry, marks.keypoints)
         known = [None if each is None else float(each[row]) for each in columns]
         known = [None if each is None or math.isnan(each) else each for each in known]
         u, v = observation.points_2d[row].tolist()
@@ -267,7 +267,7 @@ def _with_pairs(marks: Marks, observation: Observation, registry: KeypointRegist
     return marks
 
 
-def _registered(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:
+def _register(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:
     """Find a point of an observation file in the registry, or add it; returns its id."""
     wanted = point.semantic_id
     if wanted is not None and wanted not in taken and registry.has(point):

@@ -146,8 +146,8 @@ def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
     assert live.wireframe is not None
     result, shape = live.estimate.result, state.shape
     camera, alignment = result.camera, result.alignment
-    lines = live.wireframe.seen_in(camera, alignment), box_lines(result.bounds, camera, alignment)
-    edges, box = (_rounded(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
+    lines = live.wireframe.project(camera, alignment), box_lines(result.bounds, camera, alignment)
+    edges, box = (_round(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
     unmarked, regions = [], []
     if shape.learned is not None:
         registry, used = state.model.registry, state.marks.keypoints
@@ -159,19 +159,19 @@ def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
         unmarked = np.round(pixels, 1).tolist()
         if covariances is not None:
             places = camera.projected_covariances(in_camera[rows], covariances[rows])
-            regions = [_closed(region) for region in confidence_regions(pixels, places)]
+            regions = [_close(region) for region in confidence_regions(pixels, places)]
     return {"lines": edges, "box": box, "unmarked": unmarked, "regions": regions}
 
 
-def _rounded(paths: FloatArray) -> list[list[float]]:
+def _round(paths: FloatArray) -> list[list[float]]:
     """Paths (k, n, 2), each as u1, v1, u2, v2, ... to a tenth of a pixel."""
     rounded: list[list[float]] = np.round(paths, 1).reshape(len(paths), -1).tolist()
     return rounded
 
 
-def _closed(region: FloatArray) -> list[float]:
+def _close(region: FloatArray) -> list[float]:
     """A closed path (n, 2) that ends where it begins."""
-    return _rounded(np.concatenate([region, region[:1]])[None])[0]
+    return _round(np.concatenate([region, region[:1]])[None])[0]
 
 
 def evidence_labels(observation: Observation) -> list[str]:
@@ -222,7 +222,7 @@ def notes_of(state: Annotation, live: LiveAlignment) -> list[str]:
     idle = int((~live.counts).sum())
     if idle:
         subject = f"{idle} pair{'s do' if idle > 1 else ' does'} not count"
-        known = shape.known(state.model.points_of(state.marks.complete_pairs))
+        known = shape.knows(state.model.points_of(state.marks.complete_pairs))
         reason = "the mask alone aligns until there are 3"
         if shape.learned is not None and not known.all():
             reason = f"the shape of {shape.learned.category} has no such keypoint"

@@ -52,7 +52,7 @@ class PhotoFile:
         exif = FocalPrior.from_exif(self.path)
         return exif or FocalPrior.of_usual_lenses(self.width, self.height)
 
-    def encoded(self) -> tuple[str, bytes]:
+    def encode(self) -> tuple[str, bytes]:
         """Encode the upright photo for a browser: media type and bytes.
 
         A file that browsers show upright is passed on unchanged. Raises DataError if the file is
@@ -122,7 +122,7 @@ def natural_key(name: str) -> tuple[tuple[str, int], ...]:
 
 
 @dataclass(frozen=True)
-class MarkedMask:
+class ObjectMask:
     """A mask: that of a file, or a drawn one, as the bytes of a PNG file."""
 
     file: Path | None = None
@@ -130,7 +130,7 @@ class MarkedMask:
     png: bytes = b""
 
     @classmethod
-    def of(cls, inside: BoolArray) -> MarkedMask:
+    def from_pixels(cls, inside: BoolArray) -> ObjectMask:
         """A drawn mask of pixels (h, w)."""
         return cls(png=cv2.imencode(".png", 255 * inside.astype(np.uint8))[1].tobytes())
 
@@ -150,7 +150,7 @@ class MarkedMask:
         return mask
 
 
-def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
+def segment_box(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
     """Segment the object in a box of the photo (h, w, 3) by its colours, by GrabCut.
 
     ``corners`` (2, 2) are two of the box [px]. Raises InputError if the box is too small, fills the

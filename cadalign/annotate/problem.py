@@ -61,7 +61,7 @@ FitRows = Callable[[Rows, bool], Result]
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class Priors:
     """Knowledge of an object beside its observation.
 
     ``focal`` is the likely focal length, at which an unknown one is assumed, and ``focal_prior``
@@ -99,18 +99,18 @@ class LiveEstimate:
 
 @dataclass(frozen=True, eq=False)
 class LiveProblem:
-    """Arguments of `cadalign.align`; ``settles`` says that the pairs' noise is to be found."""
+    """Arguments of `cadalign.align`; ``estimates_noise`` if the pairs' noise is estimated."""
 
     model: Model | ShapeModel
     view: View
     size: Size | None = None
-    settles: bool = False
+    estimates_noise: bool = False
     estimates_focal: bool = False
     focal_prior: FocalPrior | None = None
     init: Alignment | None = None
 
     @classmethod
-    def of(cls, known: Known, observation: Observation) -> LiveProblem:
+    def make(cls, known: Priors, observation: Observation) -> LiveProblem:
         """The problem of an observation, with the options of a fit that it holds."""
         model, has_photo = known.model_for(observation), "image" in observation.fit_options
         estimates_focal = not observation.camera.focal_known
@@ -118,9 +118,9 @@ class LiveProblem:
             observation = replace(observation, camera=observation.camera.with_focal(known.focal))
         (view,) = views_of(observation, model, with_photos=has_photo)
         states_noise = observation.sigma is not None and not observation.is_plain
-        settles = not (known.shape.learned or states_noise) and bool(len(view.keypoint_ids))
+        estimates_noise = not (known.shape.learned or states_noise) and bool(len(view.keypoint_ids))
         focal = estimates_focal, known.focal_prior
-        return cls(model, view, observation.size, settles, *focal, observation.init)
+        return cls(model, view, observation.size, estimates_noise, *focal, observation.init)
 
     def estimate(self) -> LiveEstimate:
         """Align with as few assumptions as the marks need; raises a CadalignError without."""
@@ -132,8 +132,8 @@ class LiveProblem:
                 reason = error
                 continue
             has_shape = isinstance(self.model, ShapeModel)
-            judged = attempt.at_focal(result.camera) if has_shape else attempt
-            outliers = judged.contradicting()
+            judged = attempt.fix_focal(result.camera) if has_shape else attempt
+            outliers = judged.outliers()
             return LiveEstimate(result, message, sigma, {} if message else options, outliers)
         assert reason is not None
         raise reason
@@ -142,19 +142,19 @@ class LiveProblem:
         """Problems to try, the last where marks hardly suffice, and what they assume."""
         if len(self.view.keypoint_ids) or not self.estimates_focal:  # a mask alone leaves it open
             yield self, ""
-        problem = self.at_focal(self.view.camera)
+        problem = self.fix_focal(self.view.camera)
         if self.estimates_focal:
             yield problem, _FOCAL_ASSUMED
         if isinstance(self.model, Model):
             rigid = replace(self.model, stretch_sigma=None, stretch="none")
             yield replace(problem, model=rigid), _UNSTRETCHED
 
-    def at_focal(self, camera: Camera) -> LiveProblem:
+    def fix_focal(self, camera: Camera) -> LiveProblem:
         """The problem with the focal length of this camera known."""
         view = replace(self.view, camera=camera)
         return replace(self, view=view, estimates_focal=False, focal_prior=None)
 
-    def weighted(self, factor: float) -> LiveProblem:
+    def scale_sigma(self, factor: float) -> LiveProblem:
         """The problem with each pair's standard deviation times a factor."""
         sigma = factor * cast(FloatArray, self.view.sigma)
         return replace(self, view=replace(self.view, sigma=sigma))
@@ -167,20 +167,20 @@ class LiveProblem:
 
     def solve(self) -> tuple[Result, float, Mapping[str, Any]]:
         """Align at the noise that is due; with its factor [px] and the options of the fit."""
-        if not self.settles:
+        if not self.estimates_noise:
             return self.align(), LEAST_SIGMA, {}
-        factor = self._explaining_noise()
+        factor = self._estimate_noise()
         sigma = factor * np.asarray(self.view.sigma)
         options = {"sigma": sigma.tolist() if sigma.ndim else float(sigma)}
-        return self.weighted(factor).align(), factor, options
+        return self.scale_sigma(factor).align(), factor, options
 
-    def contradicting(self) -> dict[int, float]:
+    def outliers(self) -> dict[int, float]:
         """Distances [px] of the pairs that contradict the others, by their rows."""
         view, model = self.view, self.model
         alone = View(view.camera, view.points_2d, ids=view.ids, sigma=view.sigma)
         pairs = replace(self, view=alone, size=None, init=None)
         if isinstance(model, ShapeModel):
-            return pairs._left_out()
+            return pairs._robust_outliers()
         rows = {each: row for row, each in enumerate(model.ids or ())}
         points = np.asarray(model.points_3d)[[rows[each] for each in view.keypoint_ids]]
         unknowns = _UNKNOWNS + self.estimates_focal
@@ -197,10 +197,10 @@ class LiveProblem:
             # sigma=None iterates until nothing changes, which takes ten times as long.
             median = float(np.median(np.linalg.norm(result.residuals, axis=1)))
             sigma = max(LEAST_SIGMA, median / _ROBUST_SHARE)
-            result = alone.weighted(sigma).align(loss="cauchy")
+            result = alone.scale_sigma(sigma).align(loss="cauchy")
         return result
 
-    def _left_out(self) -> dict[int, float]:
+    def _robust_outliers(self) -> dict[int, float]:
         """Distances [px] of the pairs that a robust search leaves out."""
         if len(self.view.keypoint_ids) < _LEAST_JUDGED:
             return {}
@@ -211,7 +211,7 @@ class LiveProblem:
         lengths = np.linalg.norm(robust.residuals, axis=1)
         return {int(row): float(lengths[row]) for row in np.flatnonzero(~robust.inliers)}
 
-    def _explaining_noise(self) -> float:
+    def _estimate_noise(self) -> float:
         """The factor of the pairs' standard deviations that explains the residuals [px].
 
         It is the fixed point of its estimate, reached from above, so that residuals first count as
@@ -225,13 +225,13 @@ class LiveProblem:
         sigma = np.reshape(cast(FloatArray, view.sigma), (-1, 1))
         for _ in range(_NOISE_ROUNDS):
             try:
-                result = near.weighted(factor).align()
+                result = near.scale_sigma(factor).align()
             except CadalignError:
                 if view.mask is None and view.image is None:
                     raise
                 return expected  # it takes the outline
             if near.estimates_focal:
-                near = near.at_focal(result.camera)
+                near = near.fix_focal(result.camera)
             before, redundancy = factor, max(0, 2 * len(result.residuals) - _UNKNOWNS)
             squares = float(((result.residuals / sigma) ** 2).sum())
             factor = math.sqrt(

@@ -130,7 +130,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
             # Another site's name may resolve to this machine (DNS rebinding).
             Middleware(TrustedHostMiddleware, allowed_hosts=_NAMES),
         ],
-        exception_handlers={CadalignError: _refused},
+        exception_handlers={CadalignError: _refusal},
     )
 
 
@@ -184,7 +184,7 @@ class _Routes:
         return JSONResponse(photos_state(self._session))
 
     def photo(self, request: Request) -> Response:
-        kind, data = self._annotation(request).photo.encoded()
+        kind, data = self._annotation(request).photo.encode()
         return Response(data, media_type=kind)
 
     def mask(self, request: Request) -> Response:
@@ -208,9 +208,9 @@ class _Routes:
             raise InputError("not JSON", where="body", fix=fix) from None
         if not isinstance(action, dict):
             raise InputError("not a JSON object", where="body", fix=fix)
-        return await run_in_threadpool(self._acted, request.path_params["number"], action)
+        return await run_in_threadpool(self._perform, request.path_params["number"], action)
 
-    def _acted(self, number: int, action: dict[str, Any]) -> Response:
+    def _perform(self, number: int, action: dict[str, Any]) -> Response:
         with self._session.lock:
             outcome = perform(self._session, number, action)
             return JSONResponse(page_state(self._session, number, outcome))
@@ -223,5 +223,5 @@ def _asset(name: str, media_type: str, request: Request) -> Response:
     return Response(asset(name), media_type=media_type)
 
 
-async def _refused(request: Request, error: Exception) -> Response:
+async def _refusal(request: Request, error: Exception) -> Response:
     return PlainTextResponse(str(error), status_code=422)

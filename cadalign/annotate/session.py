@@ -18,10 +18,10 @@ from cadalign.annotate.files import (
     refuse_collisions,
 )
 from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel, positions_of
-from cadalign.annotate.model import OpenedModel, Wireframe, open_model
+from cadalign.annotate.model import AnnotatedModel, Wireframe, open_model
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS, ObservationFile
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
-from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem, warm_up
+from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors, warm_up
 from cadalign.arrays import BoolArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
@@ -91,7 +91,7 @@ class Annotation:
         return self.file.photo
 
     @property
-    def model(self) -> OpenedModel:
+    def model(self) -> AnnotatedModel:
         """The model of the session."""
         return self.file.model
 
@@ -131,7 +131,7 @@ class Annotation:
 
     def _align(self) -> LiveAlignment:
         file, marks, shape = self.file, self.marks, self.shape
-        observation, counting = file.observation_of(marks), file.counting(marks)
+        observation, counting = file.observation_of(marks), file.usable_pairs(marks)
         counts = np.array([pair in counting for pair in marks.complete_pairs], dtype=bool)
         if missing := missing_text(counts, shape, observation):
             return LiveAlignment(message=missing)
@@ -142,7 +142,7 @@ class Annotation:
             own: dict[Any, ModelKeypoint] = {shape.id_of(point): point for _, point in registry}
             rows = [row for row, label in enumerate(result.ids) if label in own]
             source = positions_of(own[result.ids[row]] for row in rows)
-            lines = lines.warped(source, result.points_3d[rows], result.bounds)
+            lines = lines.warp(source, result.points_3d[rows], result.bounds)
         return LiveAlignment(estimate, "", counts, lines)
 
     def _estimate(self, observation: Observation) -> LiveEstimate:
@@ -150,8 +150,8 @@ class Annotation:
         key = json.dumps([depends, hash(self.marks.mask)])  # whose file is written anew
         if self._estimated is None or self._estimated[0] != key:
             mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
-            known = Known(self.shape, mesh, likely, self.file.focal_prior)
-            self._estimated = key, LiveProblem.of(known, observation).estimate()
+            known = Priors(self.shape, mesh, likely, self.file.focal_prior)
+            self._estimated = key, LiveProblem.make(known, observation).estimate()
         return self._estimated[1]
 
 
@@ -159,7 +159,7 @@ class Annotation:
 class Session:
     """All state of an annotator; safe to use from several threads."""
 
-    model: OpenedModel
+    model: AnnotatedModel
     shape: ObjectShape = field(default_factory=ObjectShape)
     photos: list[Annotation] = field(default_factory=list)
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
@@ -246,8 +246,8 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
         what = "names the file of a single photo, but a folder is given too"
         fix = "use --out for a folder of photos, and not both options"
         raise InputError(what, where="--observation", fix=fix)
-    photos = _readable(paths) if image.is_dir() else [PhotoFile.open(paths[0])]
-    photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
+    photos = _open_photos(paths) if image.is_dir() else [PhotoFile.open(paths[0])]
+    photos[0].encode()  # refuses a damaged photo now, not when the page asks for it
     out = options.out or paths[0].parent if given is None else given.parent
     observations = [] if given is None else [given]
     for photo in photos[len(observations) :]:
@@ -278,7 +278,7 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
     return session
 
 
-def _readable(paths: list[Path]) -> list[PhotoFile]:
+def _open_photos(paths: list[Path]) -> list[PhotoFile]:
     """Open the files that are photos, with a warning about the others."""
     photos = []
     for path in paths:

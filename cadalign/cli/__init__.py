@@ -104,7 +104,7 @@ def _parse(arguments: list[str]) -> Any:
         prog = f"cadalign {name}"
         return tyro.cli(command, prog=prog, description=about, args=rest, config=config)
     stubs = [
-        Annotated[_Listed, tyro.conf.subcommand(name, description=summary)]
+        Annotated[_CommandStub, tyro.conf.subcommand(name, description=summary)]
         for name, (_, summary) in COMMANDS.items()
     ]
     listed: Any = reduce(or_, stubs)
@@ -119,5 +119,5 @@ def _parse(arguments: list[str]) -> Any:
 
 
 @dataclass(frozen=True)
-class _Listed:
+class _CommandStub:
     """A command in the list that `cadalign --help` prints."""

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from cadalign.cli.common import answer, make_folder_of, say
-from cadalign.cli.options import CameraOptions, named_as_flags
+from cadalign.cli.options import CameraOptions, name_flags
 from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
 from cadalign.datasets.coco import decode_segmentation
 from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in
@@ -58,7 +58,7 @@ class Observe(CameraOptions):
         with in_file(self.model):
             check_keypoints(model.xyz, model.model, where="keypoints.xyz")
         name = None if self.image is None else str(self.image)
-        with named_as_flags(self):
+        with name_flags(self):
             found = choose_object(objects, image=name, number=self.object)
             observation = observed_in(
                 found,
@@ -77,7 +77,7 @@ class Observe(CameraOptions):
             observation.save(out)
         called = found.image or ""
         if name is not None and Path(called).suffix and not found.is_of(name):
-            say(f"{self.keypoints} calls the photo {called}; its keypoints count for {name}")
+            say(f"{self.keypoints} names the photo {called}; its keypoints are used for {name}")
         if observation.not_found:
             say(f"{found.source}: {observation.text_of_not_found}")
         for doubt in camera_doubts(observation.camera):
@@ -90,7 +90,7 @@ class Observe(CameraOptions):
     def _write_mask(
         self, observation: Observation, found: ImageKeypoints, path: Path
     ) -> Path | None:
-        """Write the mask beside the keypoints, if a fit can use it; its path."""
+        """Write the mask if a fit can use it; returns its path, or None."""
         camera = observation.camera
         if not camera.focal_known or observation.model is None:
             missing = "--camera" if not camera.focal_known else "the mesh of MODEL"

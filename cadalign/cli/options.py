@@ -1,4 +1,4 @@
-"""Options that commands share, and errors that name them as the command line does."""
+"""Options that commands share, and errors that name the options of the command line."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ if TYPE_CHECKING:
 
 
 _FLAGS = {"fov_x": "--fov", "number": "--object"}
-"""Arguments of the library's functions that have another name on the command line."""
+"""Options of the command line whose name differs from the argument's."""
 
 
 @contextmanager
-def named_as_flags(*options: DataclassInstance, **others: str) -> Iterator[None]:
-    """Let errors about fields of dataclasses of options name the command line's options.
+def name_flags(*options: DataclassInstance, **others: str) -> Iterator[None]:
+    """Make errors about fields of options name the options of the command line.
 
-    ``others`` are flags of further arguments by name.
+    ``others`` are the flags of further arguments, by name.
     """
     flags = _FLAGS | flags_of(*options) | others
     try:
         yield
     except DataError as error:
-        if (error.fix or "").startswith("known are "):  # names of a file's fields, no options
+        if (error.fix or "").startswith("known are "):  # fields of a file, not options
             raise
-        raise DataError(error.what, where=error.where, fix=with_flags(error.fix, flags)) from None
+        raise DataError(error.what, where=error.where, fix=add_flags(error.fix, flags)) from None
     except InputError as error:
         where = flags.get(str(error.where), error.where)
-        what = str(with_flags(error.what, flags))
-        raise InputError(what, where=where, fix=with_flags(error.fix, flags)) from None
+        what = str(add_flags(error.what, flags))
+        raise InputError(what, where=where, fix=add_flags(error.fix, flags)) from None
 
 
 def flags_of(*options: DataclassInstance) -> dict[str, str]:
-    """The command line's options by the names of fields."""
+    """Return the flags of options, by the names of their fields."""
     names = [field.name for each in options for field in fields(each)]
     return {name: "--" + name.replace("_", "-") for name in names}
 
 
-def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
-    """A text that names flags in the place of arguments of several words, or in backquotes."""
+def add_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
+    """Replace names in backquotes or with an underscore by their flags."""
     for name, flag in flags.items():
         if text is not None:
             text = text.replace(f"`{name}`", flag)
@@ -63,7 +63,7 @@ def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ManyCommand(JsonOption, DetectorOptions):
-    """Options of the commands on one observation, or on many."""
+    """Options of commands on one or many observations."""
 
     out: Path | None = None
     observations: Annotated[
@@ -90,10 +90,10 @@ class ManyCommand(JsonOption, DetectorOptions):
             raise UsageError("no observation is given", where="OBSERVATION", fix=fix)
         return self.observations[0]
 
-    def only(self) -> Any:
-        """The parsed form of the only observation; None where there may be many.
+    def read_single(self) -> Any:
+        """Read the JSON of a single observation; returns None if there may be several.
 
-        What is for many observations alone is refused beside one.
+        Raises InputError if an option that only affects runs is given for a single observation.
         """
         path, data = self.first, None
         if path.suffix.lower() == ".json" and os.path.isfile(path):
@@ -118,6 +118,6 @@ class CameraOptions:
 
     @property
     def changes(self) -> ObservationChanges:
-        """Values of the options in the place of an observation's own."""
-        focal = None if isinstance(self.focal, str) else self.focal  # which a fit may estimate
+        """The camera that replaces the camera of an observation."""
+        focal = None if isinstance(self.focal, str) else self.focal  # "estimate" or "known"
         return ObservationChanges(self.camera, focal=focal)

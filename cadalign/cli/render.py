@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cadalign.cli.common import make_folder_of, say
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.options import name_flags
 from cadalign.errors import InputError
 from cadalign.io.images import JPEG_ENDING
 
@@ -49,7 +49,7 @@ class Render:
         from cadalign.render.scene import Scene
         from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
-        with named_as_flags(self, elevation="--view"):
+        with name_flags(self, elevation="--view"):
             camera, views = self._camera(), self._views()
             scene, pictures = Scene(load_mesh(self.model)), {}
             xyz = None if self.keypoints is None else ModelKeypoints.load(self.keypoints).xyz
@@ -66,13 +66,16 @@ class Render:
         return 0
 
     def _camera(self) -> Any:
-        """The camera of each picture; what the options say is checked."""
+        """Return the camera of each picture; raises InputError if an option is invalid."""
         from cadalign.geometry.camera import Camera
         from cadalign.render.scene import check_image_size
 
         size = re.fullmatch(r"(\d{1,9})[xX](\d{1,9})", self.resolution.strip())
         if size is None or not (int(size[1]) and int(size[2])):
-            what, fix = f"{self.resolution!r} is no resolution", "give WIDTHxHEIGHT, as 640x480"
+            what, fix = (
+                f"{self.resolution!r} is not a resolution",
+                "give WIDTHxHEIGHT, such as 640x480",
+            )
             raise InputError(what, where="--resolution", fix=fix)
         camera = Camera.from_fov(int(size[1]), int(size[2]), fov_x=self.fov)
         check_image_size(camera)

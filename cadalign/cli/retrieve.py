@@ -17,9 +17,9 @@ from cadalign.cli.common import (
     print_json,
     print_table,
     say,
-    waiting,
+    show_status,
 )
-from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
+from cadalign.cli.options import CameraOptions, ManyCommand, name_flags
 from cadalign.errors import DataError, refuse_unused
 from cadalign.estimation.options import Sigma
 from cadalign.io.files import keeping, made_folder, refuse_input, require_utf8
@@ -40,7 +40,7 @@ class _RetrievalOptions(RetrievalOptions):
     sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
 
     def __post_init__(self) -> None:
-        """Check nothing: options are checked once the command runs, and refused in one line."""
+        """Skip the checks: `run` makes them, and reports an error in one line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,16 +66,16 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     ] = _RetrievalOptions()
 
     def run(self) -> int:
-        """Run the retrieval, or the retrievals; returns the exit code."""
+        """Do the retrieval or the run; returns the exit code."""
         path = self.first
-        with named_as_flags(self, self.ranking):
+        with name_flags(self, self.ranking):
             how = ObservationRetrieval(
                 library=self.library,
                 shape=self.shape,
                 sigma=self.sigma,
                 ranking=RetrievalOptions(**vars(self.ranking)),
             )
-            data = self.only()
+            data = self.read_single()
             if data is None:
                 from cadalign.batch.retrievals import RetrieveRunOptions  # takes time to import
                 from cadalign.cli.runs import inputs_of, run_command
@@ -86,14 +86,14 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
             return self._retrieve(how.with_ids(query, str(path)), path, how)
 
     def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
-        """Retrieve the models of one observation, read of a path; returns the exit code."""
+        """Retrieve the models of one observation; returns the exit code."""
         from cadalign.retrieval.folder import none_text, write_retrieval
 
-        # The table needs no photo, which may have been moved.
+        # Only pictures need the photo: without them it may be missing.
         photo = None
         if self.out is not None and query.image is not None:
             photo = read_image(query.image, query.camera)
-        with waiting("retrieving (the first time after an installation takes a minute)"):
+        with show_status("retrieving (takes a minute at the first time)"):
             matches = how.retrieve(query, str(path))
         if self.json:
             print_json([match.to_dict() for match in matches])
@@ -161,14 +161,14 @@ class LibraryBuild:
         files: Iterable[Path] = own
         dataset, total = None, len(own)
         if own:
-            with named_as_flags(self):
+            with name_flags(self):
                 unused = {"categories", "split", "shapenet"}
                 refuse_unused(self, unused, "on a folder of own models")
         else:
             dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
             dataset = dataset.subset(categories=self.categories, split=self.split)
             files, total = dataset.files, len(dataset.ids())
-        with keeping(files), waiting(f"reading {total:,} models"):
+        with keeping(files), show_status(f"reading {total:,} models"):
             refuse_input(self.out)
             make_folder_of(self.out)
             if dataset is None:

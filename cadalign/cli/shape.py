@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.common import answer, group_of, make_folder_of, say, waiting
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.common import answer, group_of, make_folder_of, say, show_status
+from cadalign.cli.options import name_flags
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
 
 if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel
 
-_MODES = 5  # whose share of the variance is listed
+_MODES = 5  # that `show` describes by their share of the variance
 
 
 @dataclass(frozen=True)
@@ -40,16 +40,16 @@ class ShapeLearn:
     def run(self) -> int:
         """Learn the model; returns the exit code."""
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
-        with keeping(dataset.files), named_as_flags(self):
+        with keeping(dataset.files), name_flags(self):
             if self.out is not None:
                 refuse_input(self.out)
                 make_folder_of(self.out)
             return self._learn(dataset)
 
     def _learn(self, dataset: KeypointNet) -> int:
-        from cadalign.shapes.model import ShapeModel  # not for help of a command
+        from cadalign.shapes.model import ShapeModel  # takes time to import
 
-        with waiting(f"learning {self.category}"):
+        with show_status(f"learning {self.category}"):
             model = ShapeModel.from_dataset(
                 dataset, self.category, split=self.split, components=self.components
             )
@@ -87,7 +87,7 @@ def _text(model: ShapeModel) -> str:
         lines.append(
             f"  component {number}  {100 * each.weight:.0f} %, {len(each.modes)} modes, of which "
             f"the first {_MODES} hold {held:.0f} % of the variance; standard deviation of a "
-            f"coordinate {sigma:.3g}, {each.residual_sigma:.2g} besides the modes"
+            f"coordinate {sigma:.3g}, {each.residual_sigma:.2g} beyond the modes"
         )
     return "\n".join(lines)
 

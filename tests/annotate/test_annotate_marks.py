@@ -154,7 +154,7 @@ def test_points_without_id_or_name_get_free_ones() -> None:
         5: "seat (2)",
         added: f"point {added}",
     }
-    assert registry.given == {4, 5}
+    assert registry.file_ids == {4, 5}
     assert added == 6
 
 
@@ -189,4 +189,4 @@ def test_points_of_an_earlier_session_are_taken_in() -> None:
     )
     names = {number: point.name for number, point in registry}
     assert names == {0: "renamed", 1: "b", 7: "placed", 8: "elsewhere"}
-    assert registry.given == {0, 1, 7, 8}
+    assert registry.file_ids == {0, 1, 7, 8}

@@ -323,7 +323,7 @@ def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> 
     exif_photo(path, orientation=orientation)
     photo = PhotoFile.open(path)
     assert (photo.width, photo.height) == (400, 300)
-    kind, data = photo.encoded()
+    kind, data = photo.encode()
     assert kind == "image/jpeg"
     (case.folder / "shown.jpg").write_bytes(data)
     shown = np.asarray(Image.open(case.folder / "shown.jpg"))
@@ -439,7 +439,7 @@ def test_given_keypoints_without_ids_all_come(case: Case) -> None:
     ModelKeypoints((given[0], *bare[1:])).save(case.keypoints)
     session = case.open()
     assert [point.name for _, point in session.model.registry] == [point.name for point in given]
-    assert len(session.model.registry.given) == len(given)
+    assert len(session.model.registry.file_ids) == len(given)
 
 
 def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
@@ -451,7 +451,7 @@ def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
     session = case.open()
     keypoints = [pair.keypoint for pair in session.photos[0].marks.pairs]
     assert keypoints[1:] == ids[1:]
-    assert keypoints[0] not in session.model.registry.given
+    assert keypoints[0] not in session.model.registry.file_ids
 
 
 def test_session_prepares_its_solvers_before_it_fits(case: Case) -> None:

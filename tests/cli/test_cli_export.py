@@ -65,7 +65,7 @@ def test_the_command_says_what_is_missing(
     said = refusal(capsys, result, "--to", tmp_path / "a.json")
     assert "the name does not tell the format" in said
     Result.load(result).save(result)  # which writes no observation
-    assert "the file holds no fit with the observation" in refusal(capsys, result, *to)
+    assert "the file holds no fit with its observation" in refusal(capsys, result, *to)
     result.write_text(result.read_text()[:200])
     assert f"{result}, line" in refusal(capsys, result, *to)
     assert "no such file" in refusal(capsys, tmp_path / "gone.json", *to)

@@ -261,8 +261,8 @@ def test_one_keypoint_at_two_points_is_refused(
     moved = replace(observed(25.0), points_3d=POINTS + [[0, 0, 1e-3]])
     path = write(tmp_path, observed(), moved)
     assert refusal_line(capsys, "fit", path) == (
-        f"{path}: views[1].keypoints[0].xyz: differs from that of keypoint 0 in a view before; "
-        "give the same point of the model"
+        f"{path}: views[1].keypoints[0].xyz: differs from the xyz of keypoint 0 in an earlier "
+        "view; give the same xyz in all views"
     )
 
 

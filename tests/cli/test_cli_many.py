@@ -99,7 +99,7 @@ def test_a_detectors_file_needs_no_observations(
     assert rows[1]["source"].endswith("found.json: annotations[1]")
     capsys.readouterr()
     assert main(["fit", str(folder / "found.json"), *camera, *out]) == 1
-    assert "--model: the keypoints of the model are not known; give the" in capsys.readouterr().err
+    assert "--model: a detector's file needs a model; give the" in capsys.readouterr().err
 
 
 def test_a_camera_that_cannot_be_read_is_refused_before_the_run(

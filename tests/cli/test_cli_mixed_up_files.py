@@ -110,7 +110,7 @@ def test_another_name_of_the_photo_is_said(
 ) -> None:
     assert main(["observe", "found.json", "model.keypoints.json", "--image", "photo.png"]) == 0
     said = capsys.readouterr().err
-    assert "found.json calls the photo elsewhere.jpg; its keypoints count for photo.png" in said
+    assert "found.json names the photo elsewhere.jpg; its keypoints are used for photo.png" in said
 
 
 def test_unknown_field_is_answered_by_fields(
@@ -131,5 +131,5 @@ def test_folder_is_no_mesh(folder: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_exchanged_arguments_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["annotate", "model.obj", "photo.png", "--no-open"])
-    text = "PHOTO MODEL: model.obj is a mesh and photo.png a photo: they are exchanged"
+    text = "PHOTO MODEL: model.obj is a mesh and photo.png is a photo: swap them"
     assert text in capsys.readouterr().err

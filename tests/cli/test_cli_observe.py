@@ -98,7 +98,7 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     result = fitted(folder, "found.observation")
     captured = capsys.readouterr()
     focal = 34 / np.hypot(36, 24) * 800
-    assert f"its prior: {focal:.4g} px +- 5 %, the photo's EXIF data" in captured.err
+    assert f"with the prior {focal:.4g} px +- 5 %, the photo's EXIF data" in captured.err
     assert "  focal length " in captured.out
     prior = FocalPrior.from_exif(folder / "photo.jpg")
     expected = fit(

@@ -1,4 +1,4 @@
-"""CAD model in the annotator: exact points that clicks go to, its display, and its lines."""
+"""CAD model in the annotator: its clicked points, its display, and its lines."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from cadalign.render.surface import coincident_faces
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.warp import warp_mesh
 
-_MOST_FACES = 150_000  # that are displayed
-_SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
+_MOST_FACES = 150_000  # on display
+_SAME_PLACE = 1e-6  # largest distance of points that count as the same [diagonals]
 _MOST_DRAWN = 30_000
 _MOST_CREASES = 1500
 _MOST_LINES = 3000
 _CREASE_DEG = 30.0
-_LONGEST = 1 / 24  # of a line [diagonals]: each is drawn or hidden as a whole
+_LONGEST = 1 / 24  # line [diagonals]: each line is drawn or hidden as a whole
 _BOX_PIECES = 16
 
 
@@ -50,11 +50,11 @@ class Wireframe:
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Wireframe:
-        """The lines of a model as it is."""
+        """Find the lines of a model."""
         small = simplify(scene.mesh, max_faces=_MOST_DRAWN)
-        # Faces of real models seldom share vertices: weld those in one place.
+        # Faces of real models rarely share vertices: merge vertices in one place.
         welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
-        # A face that is written twice would make a crease of each of its sides.
+        # A duplicate face would turn all its edges into creases.
         alike, opposite = coincident_faces(welded.vertices, welded.faces)
         single = np.minimum(alike, opposite) == np.arange(len(alike))
         mesh = Mesh(welded.vertices, welded.faces[single])
@@ -71,12 +71,12 @@ class Wireframe:
         return self._mesh.vertices[self._creases]
 
     def warp(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Wireframe:
-        """The lines, warped by `cadalign.shapes.warp.warp_mesh`; the simplified mesh hides them."""
+        """Warp the lines, and the mesh that hides them, by `cadalign.shapes.warp.warp_mesh`."""
         warped = warp_mesh(self._mesh, source, target, bounds=bounds)
         return replace(self, scene=Scene(warped), _mesh=warped)
 
     def project(self, camera: Camera, alignment: Alignment) -> FloatArray:
-        """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""
+        """Project the visible lines of the stretched model to pixels (k, 2, 2)."""
         vertices = self._mesh.vertices
         eye = alignment.inverse(np.zeros((1, 3)))[0]
         ends = vertices[self._smooth]
@@ -90,7 +90,7 @@ class Wireframe:
 
 
 def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
-    """Project the edges of the stretched model's box, in pieces, (k, 2, 2) float [px]."""
+    """Project the edges of the stretched model's box, in pieces, to pixels (k, 2, 2)."""
     corners = Box.from_model(bounds, alignment).corners
     ends = corners[np.array(BOX_EDGES)]
     share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
@@ -177,7 +177,7 @@ class ClickableModel:
 
         The numbers of faces and of creases (uint32); positions (faces, 3, 3), normals (faces, 3, 3)
         and linear colours (faces, 3, 3) of corners, and creases (k, 2, 3), all float32,
-        little-endian, in display coordinates. Of triangles in one place one is shown.
+        little-endian, in display coordinates. Only one of several coincident triangles is kept.
         """
         small = simplify(self.scene.mesh, max_faces=_MOST_FACES)
         alike, opposite = coincident_faces(small.vertices, small.faces)
@@ -205,14 +205,14 @@ class AnnotatedModel:
     cad: ClickableModel
     registry: KeypointRegistry
     keypoints_path: Path
-    content: LastContent  # of that file
+    content: LastContent  # of the keypoints file
 
     def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
         """The model points of pairs that have one."""
         return [self.registry[pair.keypoint] for pair in pairs if pair.keypoint is not None]
 
     def write_keypoints(self, used: frozenset[int]) -> None:
-        """Write the given keypoints and those in use; raises DataError on failure."""
+        """Write all keypoints that are in use or from files; raises DataError on failure."""
         registry = self.registry
         self.content.refuse_changed(self.keypoints_path)
         kept = (point for number, point in registry if number in registry.file_ids | used)
@@ -223,10 +223,10 @@ class AnnotatedModel:
 def open_model(
     path: Path, folder: Path, *, keypoints: Path | None = None, shape: ObjectShape
 ) -> AnnotatedModel:
-    """Open a model, whose keypoints are written into a folder.
+    """Open a model, and read its keypoints.
 
-    ``keypoints`` are those given with it, where they are not beside it. New ones don't get the ids
-    of the shape's.
+    ``keypoints`` is its keypoint file, by default beside it; changes are written into ``folder``.
+    New keypoints do not get ids of the shape.
     """
     require_utf8(path)
     cad = ClickableModel(load_mesh(path))

@@ -1,4 +1,4 @@
-"""Web server of the annotator: page, photos, model and actions, for the session's token alone."""
+"""Web server of the annotator: page, photos, model and actions; requests need a token."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ class _Routes:
         return Response(data, media_type=kind)
 
     def mask(self, request: Request) -> Response:
-        # Its opacity is what the page draws, in a colour of its own.
+        # The page draws the opacity in its own colour.
         opacity = np.where(self._annotation(request).mask, 255, 0).astype(np.uint8)
         data = io.BytesIO()
         Image.fromarray(np.stack([np.zeros_like(opacity), opacity], axis=2), "LA").save(data, "PNG")

@@ -82,7 +82,7 @@ def test_second_process_is_refused_and_a_killed_one_leaves_no_lock(
         message = second(case, capsys, case.photo)
         assert message == (
             f"{case.folder}: another annotator has this folder open; "
-            "go on in its page or end it, or give another --observation or --out"
+            "use or close its page, or give another --observation or --out"
         )
         assert second(case, capsys, case.folder) == message
         first.act({"do": "place_uv", "uv": [30, 40]})

@@ -426,7 +426,7 @@ def test_a_box_and_one_key_align_to_the_photo(browser: Browser, case: Case) -> N
         page.keyboard.press("i")
         wait(page, f"{IDLE} && annotator.state.evidence.photo")
         expect(page.get_by_label("Fit to the photo itself")).to_be_checked()
-        expect(page.get_by_text("The photo takes the place of the mask")).to_be_visible()
+        expect(page.get_by_text("The photo replaces the mask")).to_be_visible()
         assert page.evaluate("annotator.state.alignment.also_used") == "photo"
         assert rotation_error(est=placed(session), gt=truth) < 1.0
         page.keyboard.press("Control+z")

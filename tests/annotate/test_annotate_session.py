@@ -175,7 +175,7 @@ def test_an_observation_that_others_changed_is_not_written_over(case: Case) -> N
         perform(session, 0, action)
         assert page_state(session, 0)["saved"]["trouble"] == (
             f"{case.observation}: was changed by another program since the annotator read or wrote "
-            "it; rename it to have all marks saved, or start anew to go on with that file"
+            "it; rename it to save the marks of this session, or restart to go on from it"
         )
         assert json.loads(case.observation.read_text()) == data
     perform(session, 0, {"do": "undo"})
@@ -250,7 +250,7 @@ def test_click_near_a_keypoint_takes_it(case: Case) -> None:
             "direction: the vector is zero",
         ),
         ({"do": "move", "pair": 7, "uv": [1, 2]}, "pair: there is no pair 7; reload the page"),
-        ({"do": "focal", "pixels": 0}, "pixels: 0 px is no focal length of this"),
+        ({"do": "focal", "pixels": 0}, "pixels: 0 px is not a focal length of this"),
     ],
 )
 def test_bad_actions_are_refused_and_change_nothing(
@@ -405,7 +405,8 @@ def test_annotation_goes_on_with_a_renamed_model(
     former.rename(model)
     again = case.open(model=model, prepared=False)
     assert len(again.photos[0].marks.complete_pairs) == 3
-    assert f"{case.observation}: its model {former} is gone: {model} takes its place" in caplog.text
+    text = f"{case.observation}: its model {former} no longer exists, {model} is used instead"
+    assert text in caplog.text
     perform(again, 0, {"do": "delete", "pair": 1})
     assert Observation.load(case.observation).model == model
 

@@ -116,9 +116,9 @@ def test_points_of_the_model_can_be_identified(
     (pair,) = page_state(session, 0)["pairs"]
     assert not pair["counts"]
     assert pair["keypoint"] > 77
-    with pytest.raises(CadalignError, match="no keypoint of the shape"):
+    with pytest.raises(CadalignError, match="not a keypoint of the shape"):
         perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 99})
-    with pytest.raises(CadalignError, match="has its keypoint 5 already"):
+    with pytest.raises(CadalignError, match="already has a keypoint 5"):
         perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 5})
     perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 77})
     state = page_state(session, 0)

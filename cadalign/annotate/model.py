@@ -45,7 +45,7 @@ class Wireframe:
     _mesh: Mesh  # simplified, each vertex once
     _creases: IntArray  # (k, 2) vertices of edges that always show
     _smooth: IntArray  # (k, 2) of edges that show only on the silhouette
-    _beside: IntArray  # (k, 2) third corners of the triangles beside these
+    _opposite: IntArray  # (k, 2) third corners of the two triangles at each
     _piece: float  # length of a line [model units]
 
     @classmethod
@@ -62,8 +62,8 @@ class Wireframe:
         creases, smooth = edges.ends[edges.creased], ~edges.creased
         length = np.linalg.norm(np.diff(mesh.vertices[creases], axis=1)[:, 0], axis=1)
         longest = np.sort(np.argsort(-length, kind="stable")[:_MOST_CREASES])
-        ends, beside, piece = edges.ends[smooth], edges.opposite[smooth], _LONGEST * scene.diagonal
-        return cls(scene, mesh, creases[longest], ends, beside, piece)
+        ends, third, piece = edges.ends[smooth], edges.opposite[smooth], _LONGEST * scene.diagonal
+        return cls(scene, mesh, creases[longest], ends, third, piece)
 
     @property
     def creases(self) -> FloatArray:
@@ -80,7 +80,7 @@ class Wireframe:
         vertices = self._mesh.vertices
         eye = alignment.inverse(np.zeros((1, 3)))[0]
         ends = vertices[self._smooth]
-        outline = ends[_is_outline(ends, vertices[self._beside], eye)]
+        outline = ends[_is_outline(ends, vertices[self._opposite], eye)]
         lines = np.concatenate([vertices[self._creases], outline])
         lines = _split_lines(lines, self._piece)[:_MOST_LINES]
         if not len(lines):
@@ -109,16 +109,16 @@ def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> F
     return camera.project(ends.reshape(-1, 3)).reshape(-1, 2, 2)
 
 
-def _is_outline(ends: FloatArray, beside: FloatArray, eye: FloatArray) -> BoolArray:
+def _is_outline(ends: FloatArray, opposite: FloatArray, eye: FloatArray) -> BoolArray:
     """Find the silhouette edges: both triangles on one side, seen from the eye, (e,) bool.
 
-    ``ends`` (e, 2, 3) and the third corners ``beside`` (e, 2, 3) are compared, not the normals:
+    ``ends`` (e, 2, 3) and the third corners ``opposite`` (e, 2, 3) are compared, not the normals:
     triangles of real models face either way. Stretching does not change sides, so model coordinates
     suffice.
     """
     start = ends[:, 0]
     sight = np.cross(start - eye, ends[:, 1] - eye)
-    sides = np.einsum("eck,ek->ec", beside - start[:, None], sight)
+    sides = np.einsum("eck,ek->ec", opposite - start[:, None], sight)
     return np.asarray(sides[:, 0] * sides[:, 1] > 0)
 
 

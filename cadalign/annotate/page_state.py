@@ -234,8 +234,8 @@ def notes_of(state: Annotation, live: LiveAlignment) -> list[str]:
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
             f"{how}: one more pair tells them apart."
         )
-    told = {"outlier"} if live.estimate.outliers else set()  # shown beside the pairs
-    warnings = (each.text for each in result.warnings if each.kind not in told)
+    shown = {"outlier"} if live.estimate.outliers else set()  # at the pairs
+    warnings = (each.text for each in result.warnings if each.kind not in shown)
     return notes + [text.replace("+-", "± ") for text in warnings]
 
 

@@ -30,7 +30,7 @@ from cadalign.io.observation import Observation, read_camera
 
 logger = logging.getLogger("cadalign")
 
-_LEAST_PAIRS = 4  # of an alignment without evidence beside them
+_LEAST_PAIRS = 4  # of an alignment without further evidence
 
 
 @dataclass(frozen=True, eq=False)

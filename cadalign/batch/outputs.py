@@ -81,14 +81,14 @@ def write_csv(folder: RunFolder) -> None:
 
 def warnings_text(table: pa.Table) -> str:
     """Count the rows with warnings and the rows with uncertain quantities, by kind."""
-    said = []
+    parts = []
     for column, label in WARNING_COLUMNS.items():
         rows = [{*cell.split("; ")} for cell in table[column].to_pylist() if cell]
         of_each = Counter(sorted(name for row in rows for name in row)).most_common()
         if rows:
             listed = ", ".join(f"{name} {count:,}" for name, count in of_each)
-            said.append(f"{len(rows):,} {label}: {listed}")
-    return "; ".join(said)
+            parts.append(f"{len(rows):,} {label}: {listed}")
+    return "; ".join(parts)
 
 
 NAME_COLUMNS = ("row", "source", "image", "object", "model", "match_category", "match_id")

@@ -137,10 +137,10 @@ class ManyEstimates:
             if self.folder is not None and task.row < self.options.pictures:
                 undrawn = draw_fit(self.folder, row, seen, result)
             if result is not None:
-                told = [*(("picture", text) for text in undrawn), *_doubts(seen)]
-                row["warning_count"] += len(told)
+                warnings = [*(("picture", text) for text in undrawn), *_doubts(seen)]
+                row["warning_count"] += len(warnings)
                 for column, name in enumerate(("warning_kinds", "warnings")):
-                    texts = row[name], *(each[column] for each in told)
+                    texts = row[name], *(each[column] for each in warnings)
                     row[name] = "; ".join(filter(None, texts))
         return row
 

@@ -121,8 +121,8 @@ def _describe(run: Run) -> str:
     inputs = [Path(each).name for each in run.config.get("inputs", ())]
     more = f" and {len(inputs) - 3} more" if len(inputs) > 3 else ""
     listed = f" of {', '.join(inputs[:3])}{more}" if inputs else ""
-    said = warnings_text(run.results)
-    return f"on {run.total:,} observations{listed}" + (f"; {said}" if said else "")
+    text = warnings_text(run.results)
+    return f"on {run.total:,} observations{listed}" + (f"; {text}" if text else "")
 
 
 SPEC = Spec(

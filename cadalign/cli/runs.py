@@ -118,8 +118,8 @@ def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> i
     failed = sum(count for _, count in reasons)
     _say_reasons([(_typed_reason(reason, command), count) for reason, count in reasons])
     table = folder.path / "results.csv"
-    if said := warnings_text(pq.read_table(folder.results, columns=list(WARNING_COLUMNS))):
-        say(said)
+    if text := warnings_text(pq.read_table(folder.results, columns=list(WARNING_COLUMNS))):
+        say(text)
     say(f"{total - failed:,} of {total:,} {done}, {failed:,} failed: {table}")
     if command.picture and total <= _MOST_ON_PAGE:
         write_run_report(folder)

@@ -55,8 +55,8 @@ class CorrespondenceOptions(FunctionOptions):
     For each image, share of outliers and draw, stretches the scene by factors from 0.5 to 2 along y
     and z, and moves that share of the image points to random places in the image. All methods get
     the same input. Writes results.parquet with a row per input and method, summary.csv, figures and
-    report.html. A killed run continues when the same command is started again. Measure times with
-    --workers 1.
+    report.html. A killed run continues when the same command is started again. Use --workers 1 to
+    measure times.
     """
 
     experiment = "correspondences"

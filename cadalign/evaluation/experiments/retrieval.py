@@ -67,10 +67,11 @@ METHOD = "optimal"
 class RetrievalRunOptions(ModelOptions):
     """Evaluate the retrieval of CAD models.
 
-    Stretches each model by factors from 0.5 to 2 along y and z, draws a random view, and searches
-    some of its visible keypoints, with noise, in a library with the model (leave-in) and without it
-    (leave-out). Writes results.parquet with a row per query and protocol, summary.csv, figures and
-    the library. A killed run continues when the same command is started again.
+    Stretches each model by factors from 0.5 to 2 along y and z, and draws a random view. Some of
+    its visible keypoints, with noise, are the query of a library with the model (leave-in) and of
+    a library without it (leave-out). Writes results.parquet with a row per query and protocol,
+    summary.csv, figures and the library. A killed run continues when the same command is started
+    again.
     """
 
     experiment = "retrieval"

@@ -147,9 +147,7 @@ class Annotation:
 
     def _estimate(self, observation: Observation) -> LiveEstimate:
         depends = replace(observation, unfinished=None).to_dict()
-        key = json.dumps(
-            [depends, hash(self.marks.mask)]
-        )  # the path of a mask does not tell its content
+        key = json.dumps([depends, hash(self.marks.mask)])  # a mask's path may stay the same
         if self._estimated is None or self._estimated[0] != key:
             mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
             known = Priors(self.shape, mesh, likely, self.file.focal_prior)

@@ -48,7 +48,7 @@ def estimate_of(
 
 
 def live_of(problem: SimulatedProblem, **options: Any) -> LiveAlignment:
-    """The same as the page shows it."""
+    """The live alignment of a problem, as the page shows it."""
     counts = np.ones(len(problem.points_3d), dtype=bool)
     return LiveAlignment(estimate_of(problem, **options), counts=counts)
 
@@ -86,7 +86,7 @@ def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
 
 
 def test_clicks_without_a_stated_noise_have_it_found_beside_other_evidence() -> None:
-    """By the prior on the stretch; a stated one counts."""
+    """The noise is estimated unless the observation has a sigma."""
     problem = problem_of(3, points=8, noise_px=2.0)
     upright = ImageEvidence(up=problem.alignment.rotation[:, 1])
     given = problem.points_3d, problem.points_2d, problem.camera

@@ -36,7 +36,7 @@ def test_halves_fill_the_oldest_gap_unless_another_pair_is_preferred() -> None:
     preferred, number = marks.place_keypoint(7, preferred=3)
     assert number == 3
     assert preferred.pair(3).complete
-    # A pair that has this half already cannot be filled: the oldest gap is.
+    # The preferred pair has this half already: the oldest incomplete pair gets it.
     _, number = first.place_keypoint(8, preferred=1)
     assert number == 2
 
@@ -76,7 +76,7 @@ EDITS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), max_size=25)
 
 
 def edited(marks: Marks, edit: int, which: int) -> Marks:
-    """One of all kinds of edits, on one of the pairs if there are any."""
+    """Apply one kind of edit, to one of the pairs if there are any."""
     numbers = [pair.number for pair in marks.pairs]
     if edit == 0 or not numbers:
         return marks.place_uv((float(which), 1.0))[0]

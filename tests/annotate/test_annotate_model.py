@@ -1,4 +1,4 @@
-"""Exact points on the model, whatever is shown of it."""
+"""Picked points lie on the exact model, not on the simplified display."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_wireframe_shows_the_edges_that_are_seen() -> None:
     lines = model.wireframe.project(CAMERA, alignment)
     assert lines.shape[1:] == (2, 2)
     corners = CAMERA.project(alignment.apply(model.scene.mesh.vertices))
-    # Of a box's 8 corners one is hidden, and three of its edges.
+    # One corner of a box and three edges are hidden.
     gaps = np.linalg.norm(corners[:, None] - lines.reshape(-1, 2), axis=2).min(axis=1)
     assert (gaps < 1e-6).sum() == 7
     edges = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()

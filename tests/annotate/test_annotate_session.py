@@ -1,4 +1,4 @@
-"""A session without its page: every action, what is written, and what is found again."""
+"""A session without its page: actions, written files, and reopening."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FROM_ABOVE = {"origin": [0.02, 3, 0.03], "direction": [0, -1, 0]}
 
 
 def comparable(state: dict[str, Any]) -> dict[str, Any]:
-    """A state without what a new session cannot know: undo, times, the pairs' own numbers."""
+    """A state without the parts of one session: undo, times, the numbers of pairs."""
     left_out = {"saved", "selected", "message", "can_undo", "can_redo"}
     kept = {key: value for key, value in state.items() if key not in left_out}
     kept["pairs"] = [{k: v for k, v in pair.items() if k != "pair"} for pair in state["pairs"]]
@@ -290,7 +290,7 @@ def test_camera_of_an_observation_is_used(case: Case) -> None:
 
 
 def exif_photo(path: Path, *, orientation: int = 1, focal_35mm: int | None = None) -> None:
-    """A photo whose left half is red, stored as its EXIF orientation says."""
+    """Write a photo with a red left half, stored in the given EXIF orientation."""
     pixels = np.zeros((300, 400, 3), dtype=np.uint8)
     pixels[:, :200, 0] = 250
     image = Image.fromarray(pixels)

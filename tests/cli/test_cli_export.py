@@ -1,4 +1,4 @@
-"""`cadalign export`: fits of files, as they are written and found."""
+"""`cadalign export`: fits that `cadalign fit` has written."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_views_and_warped_mesh_of_a_joint_fit(tmp_path: Path, observed: Path) ->
     target = tmp_path / "first.ply"
     assert main(["export", str(result), "--to", str(target)]) == 0
     mesh = load_mesh(target)
-    # Keypoints 0 and 1 are vertices of the wedge; the object's are where the mesh was warped to.
+    # Keypoints 0 and 1 are vertices of the wedge: the warp moves both to the object's keypoints.
     placed = POSE.apply(object_points)
     assert np.linalg.norm(mesh.vertices[[0, 1]] - placed[[0, 1]], axis=1).max() < 0.02
     assert (

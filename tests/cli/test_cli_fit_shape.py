@@ -42,7 +42,7 @@ TRUTH = Alignment(np.diag([1.0, -1, -1]) @ np.array([[0.8, 0, 0.6], [0, 1, 0], [
 
 
 def boxes(ids: Any) -> ShapeModel:
-    """The shape of boxes, whose lengths differ by a tenth."""
+    """A shape model of boxes whose lengths vary by 10 %."""
     rng = np.random.default_rng(0)
     models = []
     for row in range(40):
@@ -58,7 +58,7 @@ def numbered() -> ShapeModel:
 
 
 def write(folder: Path, count: int = 6, **fields: Any) -> Path:
-    """An observation of a box's first corners, some noise, and corners of the unit box as xyz."""
+    """Write an observation of a box's first corners, with noise; xyz is the unit box."""
     noise = np.random.default_rng(1).normal(0, 0.5, (8, 2))
     pixels = CAMERA.project(TRUTH.apply(CORNERS * RIGHT)) + noise
     fields = {"ids": np.arange(count), **fields}

@@ -49,7 +49,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def write_observations(folder: Path) -> Path:
-    """An observation of each object, in a folder."""
+    """Write an observation of each object into a folder."""
     out = folder / "seen"
     out.mkdir()
     for name, image, pose in zip(("a_0", "a_1", "b"), ("a.png", "a.png", None), POSES, strict=True):

@@ -1,4 +1,4 @@
-"""Files given in each other's place, and folders: refused in one line, by what they are."""
+"""Mixed-up files and folders are refused in one line that names their kind."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = [f"corner {row}" for row in range(10)]
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder, the present one, with an observation, a mesh, a photo and keypoints of both."""
+    """The current folder, with an observation, a mesh, a photo and keypoint files of both."""
     monkeypatch.chdir(tmp_path)
     model, camera = Path("model.obj"), PROBLEM.camera
     model.write_text(TETRAHEDRON)

@@ -1,4 +1,4 @@
-"""`cadalign render` and `cadalign doctor`: what they write, and what they refuse."""
+"""`cadalign render` and `cadalign doctor`: outputs and refusals."""
 
 from __future__ import annotations
 

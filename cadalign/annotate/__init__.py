@@ -1,1 +1,1 @@
-"""Aligning a model to a photo by clicking, in the browser."""
+"""Annotator: align a model to photos by clicking in the browser."""

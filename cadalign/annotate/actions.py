@@ -1,4 +1,4 @@
-"""Actions of the page: a function each, of which the keyword arguments are the JSON document."""
+"""Actions of the page: one function each, whose keyword arguments are the fields of the JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import msgspec
 import numpy as np
 
-from cadalign.annotate.photos import MarkedMask, cut_out
+from cadalign.annotate.photos import ObjectMask, segment_box
 from cadalign.annotate.session import Annotation, Session
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera import Camera
@@ -23,14 +23,14 @@ _FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
 
 @dataclass(frozen=True)
 class ActionOutcome:
-    """Outcome of an action beside the changed marks, for the user."""
+    """Outcome of an action, besides the changed marks."""
 
     selected: int | None = None  # number of the pair that was placed or changed
-    message: str = ""  # such as that the click missed the model
+    message: str = ""  # for the user, such as that the click missed the model
 
 
 def perform(session: Session, number: int, action: Mapping[str, Any]) -> ActionOutcome:
-    """Do an action of the page, its name ``do`` and its arguments, on a photo, and save it."""
+    """Do an action on a photo and save it; ``action`` has the name ``do`` and the arguments."""
     with session.lock:
         state = session.annotation(number)
         name = action.get("do")
@@ -44,7 +44,7 @@ def perform(session: Session, number: int, action: Mapping[str, Any]) -> ActionO
         if state.marks is not before:
             session.save(state)
         elif name in _RENAMING:
-            # Every photo that shows the keypoint has its name.
+            # The observation of every photo with the keypoint stores the name.
             keypoint = state.marks.pair(arguments["pair"]).keypoint
             for each in session.photos:
                 if keypoint in each.marks.keypoints:
@@ -65,7 +65,7 @@ def _arguments_of(function: Callable[..., ActionOutcome | None]) -> type[msgspec
 
 
 def place_uv(state: Annotation, *, uv: Point2, pair: Index | None = None) -> ActionOutcome:
-    """Place a photo half, by preference of the given pair."""
+    """Place a photo half, preferably of the given pair."""
     state.require_inside(uv)
     marks, number = state.marks.place_uv(uv, pair)
     state.record(marks)
@@ -75,8 +75,8 @@ def place_uv(state: Annotation, *, uv: Point2, pair: Index | None = None) -> Act
 def place_keypoint(
     state: Annotation, *, keypoint: Index, pair: Index | None = None
 ) -> ActionOutcome:
-    """Place a model half, a keypoint of the registry, by preference of the given pair."""
-    state.model.registry[keypoint]  # refuses an unknown one
+    """Place a model half at a keypoint of the registry, preferably of the given pair."""
+    state.model.registry[keypoint]  # raises InputError for an unknown keypoint
     marks, number = state.marks.place_keypoint(keypoint, pair)
     state.record(marks)
     return ActionOutcome(number)
@@ -90,7 +90,7 @@ def pick(
     near: Index | None = None,
     pair: Index | None = None,
 ) -> ActionOutcome:
-    """Place a model half: the keypoint ``near`` a ray, or else where that meets the surface."""
+    """Place a model half at the keypoint ``near`` a ray, or where the ray hits the surface."""
     model, registry = state.model.cad, state.model.registry
     if near is None:
         point = model.pick(model.from_display(origin), direction)
@@ -130,16 +130,16 @@ def rename(state: Annotation, *, pair: Index, name: Text) -> ActionOutcome:
 
 
 def identify(state: Annotation, *, pair: Index, label: Index | Text) -> ActionOutcome:
-    """Say which keypoint of the category's shape the model point of a pair is."""
+    """Identify the model point of a pair as a keypoint of the shape."""
     keypoint, registry = state.marks.pair(pair).keypoint, state.model.registry
     if keypoint is None or label not in state.shape.ids:
-        raise InputError(f"{quote(label)} is no keypoint of the shape", where="label")
+        raise InputError(f"{quote(label)} is not a keypoint of the shape", where="label")
     if state.shape.is_named:
         registry.rename(keypoint, str(label))
         return ActionOutcome(pair)
     if label in registry:
-        what = f"the model has its keypoint {label} already"
-        raise InputError(what, where="label", fix="click on that one")
+        what = f"the model already has a keypoint {label}"
+        raise InputError(what, where="label", fix="click on that keypoint")
     point = registry[keypoint]
     own = point.name if point.name != f"point {keypoint}" else f"keypoint {label}"
     known = registry.add(replace(point, name=own, semantic_id=int(label)))
@@ -148,7 +148,7 @@ def identify(state: Annotation, *, pair: Index, label: Index | Text) -> ActionOu
 
 
 def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
-    """Choose a known focal length, or without pixels an estimated one."""
+    """Set a known focal length; without ``pixels``, it is estimated."""
     camera = state.marks.camera
     low, high = (bound * camera.width for bound in _FOCAL_RANGE)
     if pixels is None:
@@ -162,15 +162,15 @@ def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
     elif low <= pixels <= high:
         camera = camera.with_focal(pixels)
     else:
-        what = f"{pixels:g} px is no focal length of this photo"
+        what = f"{pixels:g} px is not a focal length of this photo"
         raise InputError(what, where="pixels", fix=f"give {low:.0f} to {high:.0f} px")
     state.record(replace(state.marks, camera=camera))
 
 
 def mask_cut(state: Annotation, *, corners: tuple[Point2, Point2]) -> None:
-    """Add what GrabCut finds in a box to the mask."""
-    found = cut_out(read_photo(state.photo.path), np.array(corners, dtype=float))
-    state.record(replace(state.marks, mask=MarkedMask.of(found | state.mask)))
+    """Segment the object in a box by GrabCut, and add it to the mask."""
+    found = segment_box(read_photo(state.photo.path), np.array(corners, dtype=float))
+    state.record(replace(state.marks, mask=ObjectMask.from_pixels(found | state.mask)))
 
 
 def mask_clear(state: Annotation) -> None:
@@ -179,9 +179,9 @@ def mask_clear(state: Annotation) -> None:
 
 
 def use_photo(state: Annotation, *, on: bool) -> ActionOutcome | None:
-    """Choose whether the photo itself counts, which takes the place of the mask.
+    """Choose whether the photo itself is evidence, which replaces the mask.
 
-    What the mask alone has found is where the search in the photo begins.
+    The alignment with the mask is the start of the search in the photo.
     """
     marks = replace(state.marks, photo=on)
     if not on or marks.mask is None:
@@ -190,7 +190,7 @@ def use_photo(state: Annotation, *, on: bool) -> ActionOutcome | None:
     live = state.alignment()
     start = marks.start if live.result is None else live.result.alignment
     state.record(replace(marks, mask=None, start=start))
-    return ActionOutcome(message="The photo takes the place of the mask; undo brings it back.")
+    return ActionOutcome(message="The photo replaces the mask. Undo restores the mask.")
 
 
 def undo(state: Annotation) -> ActionOutcome | None:
@@ -212,4 +212,4 @@ ACTIONS: dict[str, Callable[..., ActionOutcome | None]] = {
 }
 """Actions by the name that the page sends as ``do``."""
 _RENAMING = ("rename", "identify")
-"""Actions that may change the names of keypoints in place of the marks."""
+"""Actions that may change names of keypoints instead of marks."""

@@ -1,7 +1,7 @@
-"""Files of an annotator: options that name them, their lock, and what others have changed.
+"""Files of an annotator: their options and names, their lock, and changes by other programs.
 
-The observation of `photo.jpg` is `photo.json`, or `photo.jpg.json` where the shorter name is
-another photo's. An observation of an earlier session is found under either name.
+The observation of `photo.jpg` is `photo.json`, or `photo.jpg.json` if another photo has the shorter
+name. An observation of an earlier session is found under either name.
 """
 
 from __future__ import annotations
@@ -28,54 +28,55 @@ _LOCK = ".annotate-lock"
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOptions:
-    """Photos, model, the files beside them, and the object's shape."""
+    """Options of a session: photos, model, their files, and the object's shape."""
 
     image: Path
     """A photo, or a folder of photos."""
     model: Path
     """OBJ, PLY, GLB, glTF, STL or OFF file."""
     observation: Path | None = None
-    """Observation file of a single photo, continued if it exists; by default beside the photo."""
+    """Observation file of a single photo, by default beside the photo. An existing file is
+    continued."""
     out: Path | None = None
-    """Folder for the observations; by default the photos'."""
+    """Folder for the observation files; by default the folder of the photos."""
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K as text, or JSON in COLMAP's form. Without one the
-    focal length is estimated."""
+    """Camera calibration file for photos without an observation file: a 3 x 3 matrix K as text, or
+    JSON with COLMAP's fields. Without a camera, the focal length is estimated."""
     focal: float | None = None
-    """Focal length of the photos [px], where no file has it, or in its place."""
+    """Focal length of photos without an observation file [px]; overrides the camera file."""
     keypoints: Path | None = None
-    """The model's keypoints: model.keypoints.json."""
+    """The model's keypoint file; by default model.keypoints.json beside the model."""
     up_axis: Literal["x", "y", "z"] | None = None
-    """The model's axis that points up, for its view and for gravity; by default the observation
-    file's, or y."""
+    """The model's up axis, for its view and for gravity; by default the observation file's axis, or
+    y."""
     shape: Path | None = None
-    """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
-    keypoints that it knows by semantic id or name."""
+    """Shape file of `cadalign shape learn`: estimate the object's own shape within its category.
+    Only keypoints with a semantic id or name of the shape count."""
 
 
 @contextmanager
-def only_annotator(folder: Path) -> Iterator[None]:
-    """Keep other annotators off a folder; a killed process holds no lock. Raises DataError."""
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Lock a folder until this process ends; raises DataError if another annotator holds it."""
     what = "another annotator has this folder open"
-    with locked(folder / _LOCK, what, fix=f"go on in its page or end it, or {_OTHER_FOLDER}"):
+    with locked(folder / _LOCK, what, fix=f"use or close its page, or {_OTHER_FOLDER}"):
         yield
 
 
 @dataclass
 class LastContent:
-    """The content of a file as it was last read or written: who changes it is no annotator."""
+    """Content of a file when it was last read or written, to detect changes by other programs."""
 
-    _known: bytes | None = None  # its checksum; None without a file
+    _known: bytes | None = None  # checksum; None without a file
 
     def note(self, path: Path) -> None:
         """Remember the content of the file, or that there is none."""
         self._known = _content(path)
 
     def refuse_changed(self, path: Path) -> None:
-        """Raise DataError if the file has other content by now."""
+        """Raise DataError if the content of the file has changed since."""
         if _content(path) not in (None, self._known):
             what = "was changed by another program since the annotator read or wrote it"
-            fix = "rename it to have all marks saved, or start anew to go on with that file"
+            fix = "rename it to save the marks of this session, or restart to go on from it"
             raise DataError(what, where=str(path), fix=fix)
 
 
@@ -89,10 +90,10 @@ def keypoints_file(model: Path, folder: Path) -> Path:
 
 
 def observation_file(photo: Path, folder: Path, others: Iterable[Path] = ()) -> Path:
-    """Path of a photo's observation in a folder: that of an earlier session, or a new one.
+    """Return the path of a photo's observation in a folder, from an earlier session or new.
 
-    ``others`` are files of other photos that may not be there yet. Raises DataError if the files of
-    these names belong to other photos.
+    ``others`` are the files of other photos, which need not exist yet. Raises DataError if both
+    names belong to other photos.
     """
     short, full = folder / f"{photo.stem}.json", folder / f"{photo.name}.json"
     owners = {path: _named_photos(path) for path in (short, full)}
@@ -108,9 +109,9 @@ def observation_file(photo: Path, folder: Path, others: Iterable[Path] = ()) -> 
 
 
 def refuse_collisions(written: Iterable[Path], read: Iterable[Path]) -> None:
-    """Refuse files to be written that are one, or one that is read, or no files of their own.
+    """Raise InputError if two files to write are the same, or one is also read.
 
-    Raises InputError.
+    Also raises it for names that are too long, and for paths that are not regular files.
     """
     seen = {_key(path) for path in read}
     for path in written:
@@ -126,21 +127,21 @@ def refuse_collisions(written: Iterable[Path], read: Iterable[Path]) -> None:
 
 
 def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
-    """Refuse a file that names another model than the annotated one; raises DataError.
+    """Raise DataError if a file names another model than the annotated one.
 
-    One that is gone is taken for this one, which was renamed or moved, with a warning.
+    If the named model no longer exists, it counts as renamed, and a warning is logged.
     """
     if named is None or named.resolve() == model.resolve():
         return
     if not named.exists():
-        logger.warning("%s: its model %s is gone: %s takes its place", where, named, model)
+        logger.warning("%s: its model %s no longer exists, %s is used instead", where, named, model)
         return
     what = f"belongs to the model {named.resolve()}, not {model.resolve()}"
     raise DataError(what, where=str(where), fix=_OTHER_FOLDER)
 
 
 def refuse_other_photo(named: Path | None, photo: Path, *, where: Path) -> None:
-    """Refuse an observation of another photo; raises DataError. One that is gone was renamed."""
+    """Raise DataError for an observation of another photo; a missing photo counts as renamed."""
     if named is not None and named.exists() and not named.samefile(photo):
         what = f"belongs to the photo {named.name}, not {photo.name}"
         fix = "give another --observation, or correct the field image in this one"
@@ -148,14 +149,14 @@ def refuse_other_photo(named: Path | None, photo: Path, *, where: Path) -> None:
 
 
 def _key(path: Path) -> str:
-    """The path as file systems compare it that ignore case."""
+    """The path in the form that file systems compare if they ignore case."""
     return str(path.parent.resolve() / path.name).casefold()
 
 
 def _named_photos(path: Path) -> list[Path]:
-    """Photos that an observation names and that are there; none where it is no observation."""
+    """The existing photos that an observation names; none if the file is no observation."""
     data: Any = None
-    if os.path.isfile(path):  # a pipe would be waited for
+    if os.path.isfile(path):  # reading a pipe would block
         with suppress(DataError):
             data = read_json(path)
     if not isinstance(data, dict):

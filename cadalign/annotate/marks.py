@@ -1,7 +1,7 @@
 """Marks of an object in a photo, their history for undo and redo, and the model's keypoints.
 
-Marks are immutable: every edit makes others, which the history keeps. They are read from the
-observation file and written to it.
+Marks are immutable: every edit makes new marks, and the history keeps them. The observation file
+stores the current marks.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.annotate.photos import MarkedMask
+from cadalign.annotate.photos import ObjectMask
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
@@ -21,7 +21,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
 
-_LONGEST = 1000  # marks in memory
+_LONGEST = 1000  # history, in marks
 _LONGEST_NAME = 80
 
 Pixel = tuple[float, float]
@@ -48,14 +48,14 @@ class Pair:
 class Marks:
     """All marks of an object in a photo.
 
-    The focal length of a camera without one is estimated. ``photo`` says that the photo itself
-    counts, ``start`` is where the search begins while there are few pairs.
+    If the camera has no focal length, it is estimated. ``photo`` says whether the photo itself is
+    evidence, ``start`` is the start of the search while there are few pairs.
     """
 
     camera: Camera
     pairs: tuple[Pair, ...] = ()
     next_number: int = 1
-    mask: MarkedMask | None = None
+    mask: ObjectMask | None = None
     photo: bool = False
     start: Alignment | None = None
 
@@ -81,34 +81,34 @@ class Marks:
         return replace(self, pairs=(*self.pairs, pair), next_number=self.next_number + 1)
 
     def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[Marks, int]:
-        """Place the photo half of a pair that lacks it, by preference of the pair of that number.
+        """Place the photo half of the preferred pair, another pair that lacks it, or a new pair.
 
-        If none lacks it, a new pair is begun. The second value is the pair's number.
+        Returns the marks and the number of the pair.
         """
-        pair = self._lacking("uv", preferred)
-        return self._with(replace(pair, uv=uv)), pair.number
+        pair = self._incomplete_pair("uv", preferred)
+        return self._replace_pair(replace(pair, uv=uv)), pair.number
 
     def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Marks, int]:
-        """Place the model half of a pair, as `place_uv`; it must not be placed already."""
+        """Place the model half of a pair, as `place_uv`; raises InputError if it is in use."""
         self._refuse_second(keypoint)
-        pair = self._lacking("keypoint", preferred)
-        return self._with(replace(pair, keypoint=keypoint)), pair.number
+        pair = self._incomplete_pair("keypoint", preferred)
+        return self._replace_pair(replace(pair, keypoint=keypoint)), pair.number
 
     def move(self, number: int, uv: Pixel) -> Marks:
         """Move the photo half of a pair."""
-        return self._with(replace(self.pair(number), uv=uv))
+        return self._replace_pair(replace(self.pair(number), uv=uv))
 
     def release_keypoint(self, number: int) -> Marks:
         """Remove the model half of a pair, so that another can be placed."""
         pair = self.pair(number)
         if pair.uv is None:
             return self.delete(number)
-        return self._with(replace(pair, keypoint=None))
+        return self._replace_pair(replace(pair, keypoint=None))
 
     def exchange_keypoint(self, number: int, keypoint: int) -> Marks:
-        """Replace the model half of a pair, of which it keeps the photo half."""
+        """Replace the model half of a pair, and keep the photo half."""
         self._refuse_second(keypoint)
-        return self._with(replace(self.pair(number), keypoint=keypoint))
+        return self._replace_pair(replace(self.pair(number), keypoint=keypoint))
 
     def delete(self, number: int) -> Marks:
         """Delete a pair."""
@@ -124,13 +124,13 @@ class Marks:
                     fix="move or delete that pair: a keypoint occurs once in a photo",
                 )
 
-    def _lacking(self, half: str, preferred: int | None) -> Pair:
-        """The preferred pair if it lacks this half, otherwise the first that does, or a new one."""
+    def _incomplete_pair(self, half: str, preferred: int | None) -> Pair:
+        """Return the preferred pair if it lacks this half, or the first such, or a new pair."""
         lacking = [pair for pair in self.pairs if getattr(pair, half) is None]
         wanted = [pair for pair in lacking if pair.number == preferred]
         return (wanted + lacking + [Pair(self.next_number)])[0]
 
-    def _with(self, changed: Pair) -> Marks:
+    def _replace_pair(self, changed: Pair) -> Marks:
         if changed.number == self.next_number:
             return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
@@ -146,7 +146,7 @@ class History:
     after: list[Marks] = field(default_factory=list)  # for redo, the next one last
 
     def record(self, marks: Marks) -> None:
-        """Go on to other marks."""
+        """Set the current marks."""
         self.before.append(self.marks)
         del self.before[:-_LONGEST]
         self.after.clear()
@@ -174,15 +174,15 @@ class History:
 class KeypointRegistry:
     """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
 
-    New points don't get ids that are ``reserved``. Points at most ``tolerance`` apart count as one
-    [model units]. The attribute ``given`` holds the ids of those that were read from files.
+    New points do not get ``reserved`` ids. Points at most ``tolerance`` apart [model units] are the
+    same point. The attribute ``file_ids`` holds the ids that were read from files.
     """
 
     def __init__(self, *, reserved: Iterable[int] = (), tolerance: float = 0.0) -> None:
         self._tolerance = tolerance
         self._points: dict[int, ModelKeypoint] = {}
         self._last_reserved = max(reserved, default=0)
-        self.given = frozenset[int]()
+        self.file_ids = frozenset[int]()
 
     def __getitem__(self, semantic_id: int) -> ModelKeypoint:
         try:
@@ -207,19 +207,19 @@ class KeypointRegistry:
         return number
 
     def merge(self, points: Iterable[ModelKeypoint]) -> None:
-        """Add points of a file; one with the id and the position of a known one renames that."""
+        """Add the points of a file; a point with the id and position of a known one renames it."""
         # Points with an id come first, so that new ids differ from theirs.
         for point in sorted(points, key=lambda each: each.semantic_id is None):
             number = point.semantic_id
             if number in self._points:
                 if self.has(point):
-                    del self._points[number]  # or its own name would be taken
+                    del self._points[number]  # frees its name
                 else:
                     point = replace(point, semantic_id=None)
-            self.given |= {self.add(point)}
+            self.file_ids |= {self.add(point)}
 
     def has(self, point: ModelKeypoint) -> bool:
-        """True if the keypoint of the point's id lies where the point does."""
+        """True if the keypoint with the point's id has the same position."""
         own = None if point.semantic_id is None else self._points.get(point.semantic_id)
         return own is not None and self.find(point.xyz, among=[own]) is not None
 
@@ -259,14 +259,14 @@ class KeypointRegistry:
 
 @dataclass(frozen=True, eq=False)
 class ObjectShape:
-    """Objects' shape: a category's learned one with its file, or that of the stretched model."""
+    """Shape of the objects: a learned shape with its file, or the stretched model."""
 
     learned: ShapeModel | None = None
     path: Path | None = None
 
     @classmethod
     def open(cls, path: Path | None) -> ObjectShape:
-        """Read the learned shape of a file, if there is one. Raises a CadalignError."""
+        """Open a learned shape, if a file is given; raises a CadalignError on failure."""
         return cls(None if path is None else ShapeModel.open(path), path)
 
     @property
@@ -276,18 +276,18 @@ class ObjectShape:
 
     @property
     def is_named(self) -> bool:
-        """True if the learned keypoints are known by their names."""
+        """True if the learned keypoints have names, not numbers."""
         return bool(self.ids) and isinstance(self.ids[0], str)
 
     @property
     def has_outline(self) -> bool:
-        """True if masks and photos say something of the shape, which then has meshes."""
+        """True if masks and photos are evidence of the shape: a learned one needs meshes."""
         training = None if self.learned is None else self.learned.training
         return self.learned is None or bool(training and training.rows_with_mesh)
 
     @property
     def average(self) -> str:
-        """The noun that the object is compared with in a sentence."""
+        """Noun phrase for the unstretched model, or for the mean of the learned shape."""
         return "the model" if self.learned is None else f"the average {self.learned.category}"
 
     @property
@@ -296,14 +296,14 @@ class ObjectShape:
         return "model units" if self.learned is None else self.learned.unit
 
     def id_of(self, point: ModelKeypoint) -> KeypointId | None:
-        """The id of a model's point in the estimate; None for one that was not learned."""
+        """Return the id of a model's point in the estimate; None if the learned shape lacks it."""
         if self.learned is None:
             return point.semantic_id
         label: KeypointId | None = point.name if self.is_named else point.semantic_id
         return label if label in self.ids else None
 
-    def known(self, points: Sequence[ModelKeypoint]) -> BoolArray:
-        """The points (n,) of which pairs count."""
+    def knows(self, points: Sequence[ModelKeypoint]) -> BoolArray:
+        """Return a mask (n,) of the points that the shape has; only their pairs count."""
         return np.array([self.id_of(point) is not None for point in points], dtype=bool)
 
 

@@ -1,4 +1,4 @@
-"""CAD model in the annotator: exact points that clicks go to, its display, and its lines."""
+"""CAD model in the annotator: its clicked points, its display, and its lines."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from cadalign.render.surface import coincident_faces
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.warp import warp_mesh
 
-_MOST_FACES = 150_000  # that are displayed
-_SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
+_MOST_FACES = 150_000  # on display
+_SAME_PLACE = 1e-6  # largest distance of points that count as the same [diagonals]
 _MOST_DRAWN = 30_000
 _MOST_CREASES = 1500
 _MOST_LINES = 3000
 _CREASE_DEG = 30.0
-_LONGEST = 1 / 24  # of a line [diagonals]: each is drawn or hidden as a whole
+_LONGEST = 1 / 24  # line [diagonals]: each line is drawn or hidden as a whole
 _BOX_PIECES = 16
 
 
@@ -45,16 +45,16 @@ class Wireframe:
     _mesh: Mesh  # simplified, each vertex once
     _creases: IntArray  # (k, 2) vertices of edges that always show
     _smooth: IntArray  # (k, 2) of edges that show only on the silhouette
-    _beside: IntArray  # (k, 2) third corners of the triangles beside these
+    _opposite: IntArray  # (k, 2) third corners of the two triangles at each
     _piece: float  # length of a line [model units]
 
     @classmethod
-    def of_scene(cls, scene: Scene) -> Wireframe:
-        """The lines of a model as it is."""
+    def from_scene(cls, scene: Scene) -> Wireframe:
+        """Find the lines of a model."""
         small = simplify(scene.mesh, max_faces=_MOST_DRAWN)
-        # Faces of real models seldom share vertices: weld those in one place.
+        # Faces of real models rarely share vertices: merge vertices in one place.
         welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
-        # A face that is written twice would make a crease of each of its sides.
+        # A duplicate face would turn all its edges into creases.
         alike, opposite = coincident_faces(welded.vertices, welded.faces)
         single = np.minimum(alike, opposite) == np.arange(len(alike))
         mesh = Mesh(welded.vertices, welded.faces[single])
@@ -62,27 +62,27 @@ class Wireframe:
         creases, smooth = edges.ends[edges.creased], ~edges.creased
         length = np.linalg.norm(np.diff(mesh.vertices[creases], axis=1)[:, 0], axis=1)
         longest = np.sort(np.argsort(-length, kind="stable")[:_MOST_CREASES])
-        ends, beside, piece = edges.ends[smooth], edges.opposite[smooth], _LONGEST * scene.diagonal
-        return cls(scene, mesh, creases[longest], ends, beside, piece)
+        ends, third, piece = edges.ends[smooth], edges.opposite[smooth], _LONGEST * scene.diagonal
+        return cls(scene, mesh, creases[longest], ends, third, piece)
 
     @property
     def creases(self) -> FloatArray:
         """The lines that always show, (k, 2, 3) float [model units]."""
         return self._mesh.vertices[self._creases]
 
-    def warped(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Wireframe:
-        """The lines, warped by `cadalign.shapes.warp.warp_mesh`; the simplified mesh hides them."""
+    def warp(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Wireframe:
+        """Warp the lines, and the mesh that hides them, by `cadalign.shapes.warp.warp_mesh`."""
         warped = warp_mesh(self._mesh, source, target, bounds=bounds)
         return replace(self, scene=Scene(warped), _mesh=warped)
 
-    def seen_in(self, camera: Camera, alignment: Alignment) -> FloatArray:
-        """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""
+    def project(self, camera: Camera, alignment: Alignment) -> FloatArray:
+        """Project the visible lines of the stretched model to pixels (k, 2, 2)."""
         vertices = self._mesh.vertices
         eye = alignment.inverse(np.zeros((1, 3)))[0]
         ends = vertices[self._smooth]
-        outline = ends[_is_outline(ends, vertices[self._beside], eye)]
+        outline = ends[_is_outline(ends, vertices[self._opposite], eye)]
         lines = np.concatenate([vertices[self._creases], outline])
-        lines = _cut(lines, self._piece)[:_MOST_LINES]
+        lines = _split_lines(lines, self._piece)[:_MOST_LINES]
         if not len(lines):
             return np.empty((0, 2, 2))
         seen = visible_keypoints(self.scene, lines.mean(axis=1), camera, alignment)
@@ -90,7 +90,7 @@ class Wireframe:
 
 
 def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
-    """Project the edges of the stretched model's box, in pieces, (k, 2, 2) float [px]."""
+    """Project the edges of the stretched model's box, in pieces, to pixels (k, 2, 2)."""
     corners = Box.from_model(bounds, alignment).corners
     ends = corners[np.array(BOX_EDGES)]
     share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
@@ -109,20 +109,20 @@ def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> F
     return camera.project(ends.reshape(-1, 3)).reshape(-1, 2, 2)
 
 
-def _is_outline(ends: FloatArray, beside: FloatArray, eye: FloatArray) -> BoolArray:
+def _is_outline(ends: FloatArray, opposite: FloatArray, eye: FloatArray) -> BoolArray:
     """Find the silhouette edges: both triangles on one side, seen from the eye, (e,) bool.
 
-    ``ends`` (e, 2, 3) and the third corners ``beside`` (e, 2, 3) are compared, not the normals:
+    ``ends`` (e, 2, 3) and the third corners ``opposite`` (e, 2, 3) are compared, not the normals:
     triangles of real models face either way. Stretching does not change sides, so model coordinates
     suffice.
     """
     start = ends[:, 0]
     sight = np.cross(start - eye, ends[:, 1] - eye)
-    sides = np.einsum("eck,ek->ec", beside - start[:, None], sight)
+    sides = np.einsum("eck,ek->ec", opposite - start[:, None], sight)
     return np.asarray(sides[:, 0] * sides[:, 1] > 0)
 
 
-def _cut(lines: FloatArray, piece: float) -> FloatArray:
+def _split_lines(lines: FloatArray, piece: float) -> FloatArray:
     if not len(lines):
         return lines
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
@@ -149,7 +149,7 @@ class ClickableModel:
     @cached_property
     def wireframe(self) -> Wireframe:
         """The lines of the model."""
-        return Wireframe.of_scene(self.scene)
+        return Wireframe.from_scene(self.scene)
 
     def to_display(self, xyz: npt.ArrayLike) -> FloatArray:
         """Turn model coordinates (..., 3) into the page's: centred, with a diagonal of 1."""
@@ -177,7 +177,7 @@ class ClickableModel:
 
         The numbers of faces and of creases (uint32); positions (faces, 3, 3), normals (faces, 3, 3)
         and linear colours (faces, 3, 3) of corners, and creases (k, 2, 3), all float32,
-        little-endian, in display coordinates. Of triangles in one place one is shown.
+        little-endian, in display coordinates. Only one of several coincident triangles is kept.
         """
         small = simplify(self.scene.mesh, max_faces=_MOST_FACES)
         alike, opposite = coincident_faces(small.vertices, small.faces)
@@ -198,35 +198,35 @@ class ClickableModel:
 
 
 @dataclass(eq=False)
-class OpenedModel:
+class AnnotatedModel:
     """A model that can be clicked on, its keypoints, and the file they are written to."""
 
     path: Path
     cad: ClickableModel
     registry: KeypointRegistry
     keypoints_path: Path
-    content: LastContent  # of that file
+    content: LastContent  # of the keypoints file
 
     def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
         """The model points of pairs that have one."""
         return [self.registry[pair.keypoint] for pair in pairs if pair.keypoint is not None]
 
     def write_keypoints(self, used: frozenset[int]) -> None:
-        """Write the given keypoints and those in use; raises DataError on failure."""
+        """Write all keypoints that are in use or from files; raises DataError on failure."""
         registry = self.registry
         self.content.refuse_changed(self.keypoints_path)
-        kept = (point for number, point in registry if number in registry.given | used)
+        kept = (point for number, point in registry if number in registry.file_ids | used)
         ModelKeypoints(tuple(kept), self.path).save(self.keypoints_path)
         self.content.note(self.keypoints_path)
 
 
 def open_model(
     path: Path, folder: Path, *, keypoints: Path | None = None, shape: ObjectShape
-) -> OpenedModel:
-    """Open a model, whose keypoints are written into a folder.
+) -> AnnotatedModel:
+    """Open a model, and read its keypoints.
 
-    ``keypoints`` are those given with it, where they are not beside it. New ones don't get the ids
-    of the shape's.
+    ``keypoints`` is its keypoint file, by default beside it; changes are written into ``folder``.
+    New keypoints do not get ids of the shape.
     """
     require_utf8(path)
     cad = ClickableModel(load_mesh(path))
@@ -240,4 +240,4 @@ def open_model(
             if source == own:
                 refuse_other_model(read.model, path, where=own)
             registry.merge(read.keypoints)
-    return OpenedModel(path, cad, registry, own, content)
+    return AnnotatedModel(path, cad, registry, own, content)

@@ -1,7 +1,7 @@
-"""Reading an observation file into marks, and writing marks to it: the only state that lasts.
+"""Observation files of the annotator: read marks, and write marks.
 
-The observation's field ``unfinished`` has what a fit cannot use: pairs with only one half placed,
-and those whose keypoint the category's shape lacks.
+The field ``unfinished`` of an observation holds the pairs that a fit cannot use: one half is not
+placed, or the shape lacks the keypoint.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 
 from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
 from cadalign.annotate.marks import KeypointRegistry, Marks, ObjectShape, Pair, positions_of
-from cadalign.annotate.model import OpenedModel
-from cadalign.annotate.photos import MarkedMask, PhotoFile, camera_of
+from cadalign.annotate.model import AnnotatedModel
+from cadalign.annotate.photos import ObjectMask, PhotoFile, camera_of
 from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
@@ -34,11 +34,11 @@ from cadalign.io.observation import Observation
 logger = logging.getLogger("cadalign")
 
 LIKELY_STRETCH = 0.25
-"""Standard deviation of the logarithm of each scale about 1, where the file states no other."""
+"""Standard deviation of the logarithm of each scale, unless the file has another one."""
 LEAST_JOINT_PAIRS = 3
-"""Pairs of an alignment with evidence beside them; fewer need a start."""
+"""Minimum number of pairs of an alignment with further evidence; fewer need a start."""
 _OTHER_FILE = "give another --observation or --out"
-# Fields that are not of one image.
+# Fields of the object, not of one image.
 _OF_THE_OBJECT = (
     *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
 )
@@ -46,7 +46,7 @@ _OWN_OPTIONS = {"stretch_sigma", "focal_prior", "image"}
 
 
 class _Half(KeypointFields, kw_only=True):
-    """Pair with only the photo half or the model half, or both of which are of no use to a fit."""
+    """Pair that a fit cannot use: one half is missing, or the shape lacks its keypoint."""
 
     uv: Point2 | None = None
 
@@ -65,17 +65,17 @@ class ObservationFile:
 
     path: Path
     photo: PhotoFile
-    model: OpenedModel
+    model: AnnotatedModel
     shape: ObjectShape
     stored: Observation = field(init=False)
-    """Content of the file when it was opened, of which marks take the place."""
+    """Content of the file when it was opened; the marks replace parts of it."""
     _content: LastContent = field(default_factory=LastContent, repr=False)
-    _drawn: tuple[MarkedMask, Path] | None = None  # the mask that was written last, and its file
+    _drawn: tuple[ObjectMask, Path] | None = None  # the last mask that was written, and its file
 
     def read(self, given: Camera | None, *, up_axis: Any = None) -> Marks:
-        """Read an earlier session's marks, and add new model points to the registry.
+        """Read the marks of an earlier session, and add new model points to the registry.
 
-        ``given`` is the camera where the file has none. Raises a CadalignError.
+        ``given`` is the camera if there is no file. Raises a CadalignError if a file is invalid.
         """
         self._content.note(self.path)
         if not self.path.exists():
@@ -85,7 +85,7 @@ class ObservationFile:
             return Marks(camera)
         stored = self._load()
         if stored.others:
-            what = f"has {len(stored.views)} views, the annotator opens files of one photo"
+            what = f"has {len(stored.views)} views, the annotator only opens files of one photo"
             raise DataError(what, where=str(self.path), fix=_OTHER_FILE)
         refuse_other_model(stored.model, self.model.path, where=self.path)
         refuse_other_photo(stored.image, self.photo.path, where=self.path)
@@ -96,18 +96,17 @@ class ObservationFile:
         mask = stored.evidence.mask
         marks = Marks(
             camera_of(self.photo, stored.camera),
-            mask=None if mask is None else MarkedMask(mask, stored.evidence.mask_sigma),
+            mask=None if mask is None else ObjectMask(mask, stored.evidence.mask_sigma),
             photo=bool(stored.fit_options.get("image")),
             start=stored.init,
         )
-        marks = _with_pairs(marks, stored, self.model.registry)
-        return _with_halves(marks, unfinished.pairs, self.model.registry)
+        marks = _add_pairs(marks, stored, self.model.registry)
+        return _add_halves(marks, unfinished.pairs, self.model.registry)
 
     def write(self, observation: Observation) -> None:
-        """Write the observation as a whole; raises DataError on failure.
+        """Write the observation; raises DataError on failure, or if others changed the file.
 
-        Killed at any moment, the file has everything of before or of now. A file that was changed
-        by others is refused.
+        A killed process leaves either the old or the new content.
         """
         self._content.refuse_changed(self.path)
         observation.save(self.path)
@@ -115,24 +114,24 @@ class ObservationFile:
 
     @property
     def focal_prior(self) -> FocalPrior | None:
-        """Prior on an estimated focal length, as `cadalign fit` has it."""
+        """Prior on an estimated focal length, as in `cadalign fit`."""
         stored = self.stored.fit_options.get("focal_prior", self.photo.likely_focal)
         return FocalPrior(**stored) if isinstance(stored, Mapping) else stored
 
     @property
     def stretch_sigma(self) -> float | None:
-        """Prior on the stretch; None for a shape, which has its own."""
+        """Standard deviation of the prior on the stretch; None for a learned shape."""
         if self.shape.learned is not None:
             return None
         return self.stored.fit_options.get("stretch_sigma") or LIKELY_STRETCH
 
-    def counting(self, marks: Marks) -> tuple[Pair, ...]:
-        """Complete pairs that a fit uses: those whose keypoints the shape knows.
+    def usable_pairs(self, marks: Marks) -> tuple[Pair, ...]:
+        """Return the complete pairs that a fit uses: pairs of keypoints that the shape has.
 
-        Few count beside a mask only where a start is known: the mask alone aligns until then.
+        With a mask and without a start, a few pairs are not used: the mask alone aligns.
         """
         pairs = marks.complete_pairs
-        known = self.shape.known(self.model.points_of(pairs))
+        known = self.shape.knows(self.model.points_of(pairs))
         counting = tuple(pair for pair, counts in zip(pairs, known, strict=True) if counts)
         by_mask = marks.mask is not None and marks.start is None and self.shape.learned is None
         return () if by_mask and len(counting) < LEAST_JOINT_PAIRS else counting
@@ -140,11 +139,11 @@ class ObservationFile:
     def observation_of(
         self, marks: Marks, *, sigma: Mapping[str, Any] | None = None
     ) -> Observation:
-        """The observation of marks, of which the file keeps all else.
+        """Build the observation of marks; its other fields are the stored ones.
 
-        ``sigma`` is the option for the noise that the pairs show.
+        ``sigma`` is the option for the estimated noise of the pairs.
         """
-        pairs = self.counting(marks)
+        pairs = self.usable_pairs(marks)
         points = self.model.points_of(pairs)
         options = {**(sigma or {})}
         if self.stretch_sigma is not None:
@@ -159,7 +158,7 @@ class ObservationFile:
         mask_sigma = None if marks.mask is None else marks.mask.sigma
         mask = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
         evidence = msgspec.structs.replace(self.stored.evidence, **mask)
-        if not has_depths:  # all keypoints with depths may be gone
+        if not has_depths:  # all keypoints with depths may be deleted
             evidence = msgspec.structs.replace(evidence, depth_sigma=None)
         halves = [self._half(pair) for pair in marks.pairs if pair not in pairs]
         return replace(
@@ -167,10 +166,10 @@ class ObservationFile:
             points_3d=positions_of(points),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=marks.camera,
-            sigma=_filled(pair.sigma for pair in pairs),
+            sigma=_fill_missing(pair.sigma for pair in pairs),
             ids=np.array([point.semantic_id for point in points], dtype=np.int64),
             names=tuple(point.name for point in points),
-            scores=_filled(pair.score for pair in pairs),
+            scores=_fill_missing(pair.score for pair in pairs),
             image=self.photo.path,
             depths=depths if has_depths else None,
             evidence=evidence,
@@ -182,7 +181,7 @@ class ObservationFile:
         )
 
     def _half(self, pair: Pair) -> dict[str, Any]:
-        """A pair as the field of unfinished ones holds it."""
+        """Return a pair as the field ``unfinished`` stores it."""
         fields = {name: getattr(pair, name) for name in ("uv", "sigma", "score", "depth")}
         if pair.keypoint is not None:
             point = self.model.registry[pair.keypoint]
@@ -190,7 +189,7 @@ class ObservationFile:
         return {name: value for name, value in fields.items() if value is not None}
 
     def _mask_file(self, marks: Marks) -> Path | None:
-        """The file of the mask, if there is one; a drawn one is written if it is not yet."""
+        """Return the file of the mask, if there is one; writes a drawn mask if necessary."""
         if marks.mask is None or marks.mask.file is not None:
             return None if marks.mask is None else marks.mask.file
         mask, path = self._drawn or (None, None)
@@ -207,7 +206,7 @@ class ObservationFile:
     def _load(self) -> Observation:
         data = read_json(self.path)
         if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
-            # All pairs were deleted: what is left is kept, and unfinished pairs are the model's.
+            # All pairs were deleted. The view keeps its other fields, the file keeps the rest.
             of_the_object = {name: data.pop(name) for name in _OF_THE_OBJECT if name in data}
             with in_file(self.path):
                 data = {"views": [data], **of_the_object}
@@ -218,7 +217,7 @@ class ObservationFile:
         """Warn of stored options of the fit that the page does not use."""
         options = dict(stored.fit_options)
         if "stretch_sigma" in options or options.get("sigma") is None:
-            options.pop("sigma", None)  # found by the annotator, or not stated
+            options.pop("sigma", None)  # estimated by the annotator, or not set
         others = [name for name in options if name not in _OWN_OPTIONS]
         if stored.shape is not None and self.shape.path is None:
             others.append(f"shape {stored.shape}")
@@ -230,21 +229,21 @@ class ObservationFile:
             )
 
 
-def _filled(values: Iterable[float | None]) -> FloatArray | None:
-    """The values (n,), 1 where one is missing; None if all are missing."""
+def _fill_missing(values: Iterable[float | None]) -> FloatArray | None:
+    """Return the values (n,), with 1 for missing ones; None if all are missing."""
     listed = list(values)
     if all(value is None for value in listed):
         return None
     return np.array([1.0 if value is None else value for value in listed])
 
 
-def _with_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistry) -> Marks:
-    """The marks with unfinished pairs, of which some are of no use any more."""
+def _add_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistry) -> Marks:
+    """Add unfinished pairs to the marks, except pairs of which no half is left."""
     for half in halves:
         keypoint = half.semantic_id
         if half.xyz is not None:
             point = ModelKeypoint(half.name or "", half.xyz, keypoint)
-            keypoint = _registered(point, registry, marks.keypoints)
+            keypoint = _register(point, registry, marks.keypoints)
         elif keypoint not in registry or keypoint in marks.keypoints:
             keypoint = None
         if half.uv is not None or keypoint is not None:
@@ -253,13 +252,13 @@ def _with_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegist
     return marks
 
 
-def _with_pairs(marks: Marks, observation: Observation, registry: KeypointRegistry) -> Marks:
+def _add_pairs(marks: Marks, observation: Observation, registry: KeypointRegistry) -> Marks:
     ids, names = observation.ids, observation.names
     columns = (observation.sigma, observation.scores, observation.depths)
     for row, (x, y, z) in enumerate(observation.points_3d.tolist()):
         number = None if ids is None else int(ids[row])
         point = ModelKeypoint("" if names is None else names[row], (x, y, z), number)
-        keypoint = _registered(point, registry, marks.keypoints)
+        keypoint = _register(point, registry, marks.keypoints)
         known = [None if each is None else float(each[row]) for each in columns]
         known = [None if each is None or math.isnan(each) else each for each in known]
         u, v = observation.points_2d[row].tolist()
@@ -267,7 +266,7 @@ def _with_pairs(marks: Marks, observation: Observation, registry: KeypointRegist
     return marks
 
 
-def _registered(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:
+def _register(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:
     """Find a point of an observation file in the registry, or add it; returns its id."""
     wanted = point.semantic_id
     if wanted is not None and wanted not in taken and registry.has(point):

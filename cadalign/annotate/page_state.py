@@ -1,4 +1,4 @@
-"""State of the page as plain data for JSON: a photo's annotation, and the list of photos."""
+"""State of the page as plain data for JSON: the annotation of a photo, and the photos."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from cadalign.io.observation import Observation
 from cadalign.render.layers import confidence_regions
 
 _LABELS = {"up": "gravity", "camera_height": "camera height", "cam_from_rig": "camera pose"}
-_LEFT_OPEN = 0.8  # share of a prior's standard deviation beyond which the pairs say nothing
+_LEFT_OPEN = 0.8  # of a prior's standard deviation; beyond it, the pairs add no information
 _UNDETERMINED = "not determined", "these pairs leave it open"
 
 
 def page_state(
     session: Session, number: int, outcome: ActionOutcome | None = None
 ) -> dict[str, Any]:
-    """Collect everything that the page shows of a photo, after an action of that outcome."""
+    """Collect all that the page shows of a photo, with the outcome of an action."""
     outcome = outcome or ActionOutcome()
     with session.lock:
         state = session.annotation(number)
@@ -85,7 +85,7 @@ def photos_state(session: Session) -> list[dict[str, Any]]:
 
 
 def _shape(state: Annotation) -> dict[str, Any] | None:
-    """The shape's category, and the keypoints of it that the model lacks."""
+    """Return the shape's category, and its keypoints that the model lacks."""
     shape = state.shape
     if shape.learned is None:
         return None
@@ -97,7 +97,7 @@ def _shape(state: Annotation) -> dict[str, Any] | None:
 
 
 def _pairs(state: Annotation, live: LiveAlignment) -> list[dict[str, Any]]:
-    """The pairs with their residuals; those that contradict the others are ``off`` [px]."""
+    """Return the pairs with their residuals; outliers are ``off`` by a distance [px]."""
     counting, row = iter(live.counts), 0
     pairs = []
     for pair in state.marks.pairs:
@@ -141,13 +141,13 @@ def _alignment(state: Annotation, live: LiveAlignment, *, is_ready: bool) -> dic
 
 
 def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
-    """Box and edges of the model and, for an own shape, unmarked keypoints with 95 % regions."""
+    """Return box and edges of the model, and unmarked keypoints of a learned shape."""
     assert live.estimate is not None
     assert live.wireframe is not None
     result, shape = live.estimate.result, state.shape
     camera, alignment = result.camera, result.alignment
-    lines = live.wireframe.seen_in(camera, alignment), box_lines(result.bounds, camera, alignment)
-    edges, box = (_rounded(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
+    lines = live.wireframe.project(camera, alignment), box_lines(result.bounds, camera, alignment)
+    edges, box = (_round(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
     unmarked, regions = [], []
     if shape.learned is not None:
         registry, used = state.model.registry, state.marks.keypoints
@@ -159,23 +159,23 @@ def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
         unmarked = np.round(pixels, 1).tolist()
         if covariances is not None:
             places = camera.projected_covariances(in_camera[rows], covariances[rows])
-            regions = [_closed(region) for region in confidence_regions(pixels, places)]
+            regions = [_close(region) for region in confidence_regions(pixels, places)]
     return {"lines": edges, "box": box, "unmarked": unmarked, "regions": regions}
 
 
-def _rounded(paths: FloatArray) -> list[list[float]]:
-    """Paths (k, n, 2), each as u1, v1, u2, v2, ... to a tenth of a pixel."""
+def _round(paths: FloatArray) -> list[list[float]]:
+    """Round paths (k, n, 2) to 0.1 px, and flatten each to u1, v1, u2, v2, ..."""
     rounded: list[list[float]] = np.round(paths, 1).reshape(len(paths), -1).tolist()
     return rounded
 
 
-def _closed(region: FloatArray) -> list[float]:
-    """A closed path (n, 2) that ends where it begins."""
-    return _rounded(np.concatenate([region, region[:1]])[None])[0]
+def _close(region: FloatArray) -> list[float]:
+    """Close a path (n, 2), so that it ends at its start."""
+    return _round(np.concatenate([region, region[:1]])[None])[0]
 
 
 def evidence_labels(observation: Observation) -> list[str]:
-    """Name what an observation holds beyond keypoints, for the page."""
+    """Name the evidence of an observation besides keypoints, for the page."""
     names = dict.fromkeys(observation.evidence.sources)
     if observation.depths is not None:
         names["depth"] = None
@@ -190,9 +190,9 @@ def evidence_labels(observation: Observation) -> list[str]:
 def facts_of(
     live: LiveAlignment, shape: ObjectShape, *, prior: float | None = None
 ) -> list[dict[str, str]]:
-    """Stretch or lengths, pose and residuals: label, value with standard deviation, and a remark.
+    """List stretch or lengths, pose and residuals: label, value with standard deviation, note.
 
-    ``prior`` is the standard deviation of the stretch before any pair.
+    ``prior`` is the standard deviation of the prior on the stretch.
     """
     assert live.estimate is not None
     result = live.estimate.result
@@ -215,14 +215,14 @@ def facts_of(
 
 
 def notes_of(state: Annotation, live: LiveAlignment) -> list[str]:
-    """Assumptions, pairs that do not count, alternative alignments and warnings."""
+    """List assumptions, pairs that do not count, alternative alignments and warnings."""
     assert live.estimate is not None
     result, shape = live.estimate.result, state.shape
     notes = [live.estimate.message] if live.estimate.message else []
     idle = int((~live.counts).sum())
     if idle:
         subject = f"{idle} pair{'s do' if idle > 1 else ' does'} not count"
-        known = shape.known(state.model.points_of(state.marks.complete_pairs))
+        known = shape.knows(state.model.points_of(state.marks.complete_pairs))
         reason = "the mask alone aligns until there are 3"
         if shape.learned is not None and not known.all():
             reason = f"the shape of {shape.learned.category} has no such keypoint"
@@ -234,15 +234,15 @@ def notes_of(state: Annotation, live: LiveAlignment) -> list[str]:
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
             f"{how}: one more pair tells them apart."
         )
-    told = {"outlier"} if live.estimate.outliers else set()  # beside the pairs
-    warnings = (each.text for each in result.warnings if each.kind not in told)
+    shown = {"outlier"} if live.estimate.outliers else set()  # at the pairs
+    warnings = (each.text for each in result.warnings if each.kind not in shown)
     return notes + [text.replace("+-", "± ") for text in warnings]
 
 
 def _extent(
     result: Result, axis: str, shape: ObjectShape, *, prior: float | None
 ) -> tuple[str, str]:
-    """Length of the object along an axis, or its stretch where that has a prior."""
+    """Return the length of the object along an axis, or its stretch if that has a prior."""
     row, average = "xyz".index(axis), shape.average
     value = stretch = float(result.stretch[row])
     relative = 0.0 if result.std is None else float(result.std.scale[row])
@@ -282,5 +282,5 @@ def _focal(result: Result, *, is_assumed: bool) -> tuple[str, str]:
 
 
 def short(value: float) -> str:
-    """Two digits, without an exponent."""
+    """Format a number with two digits, without an exponent."""
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

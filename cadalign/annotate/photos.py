@@ -1,4 +1,4 @@
-"""Photos to annotate: upright pixels, the cameras that took them, and masks of objects."""
+"""Photos to annotate: upright pixels, cameras, and masks of objects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
 _ORIENTATION = 0x0112  # the EXIF tag
 _TURNED = range(2, 9)  # its values for photos that are not stored upright
 _QUALITY = 95
-_LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
+_LONGEST_CUT = 800  # longest side of the photo for the segmentation [px]
 _LEAST_BOX = 4.0  # [px]
 _CUT_ROUNDS = 5
 
@@ -48,11 +48,11 @@ class PhotoFile:
 
     @cached_property
     def likely_focal(self) -> FocalPrior:
-        """Prior on an unknown focal length: of the EXIF data, or that of usual lenses."""
+        """Prior on an unknown focal length: from the EXIF data, or for usual lenses."""
         exif = FocalPrior.from_exif(self.path)
         return exif or FocalPrior.of_usual_lenses(self.width, self.height)
 
-    def encoded(self) -> tuple[str, bytes]:
+    def encode(self) -> tuple[str, bytes]:
         """Encode the upright photo for a browser: media type and bytes.
 
         A file that browsers show upright is passed on unchanged. Raises DataError if the file is
@@ -70,14 +70,14 @@ class PhotoFile:
 
 
 def find_photos(path: Path) -> list[Path]:
-    """List the photos of a folder by name, numbers in order, or the given photo."""
+    """List the photos of a folder in natural order of their names, or the given photo."""
     with reading(path):
         in_folder, exists = path.is_dir(), path.exists()
         entries = listed(path) if in_folder else []
     if in_folder:
         photos = [p for p in entries if p.suffix.lower() in PHOTO_ENDINGS and p.is_file()]
         stems = {p.stem for p in photos}
-        # Without the masks of photos, as the annotator names them.
+        # Leave out the masks that the annotator has written.
         own = [p for p in photos if p.name == (stem := _MASK.sub("", p.name)) or stem not in stems]
         if not own:
             fix = f"file names of photos end in {', '.join(PHOTO_ENDINGS)}"
@@ -89,7 +89,7 @@ def find_photos(path: Path) -> list[Path]:
 
 
 def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
-    """The camera that took a photo, by default one without a focal length; raises DataError."""
+    """Return a photo's camera, by default without a focal length; raises DataError for others."""
     if camera is None:
         return Camera.without_focal(photo.width, photo.height)
     if (camera.width, camera.height) != (photo.width, photo.height):
@@ -101,16 +101,14 @@ def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
         )
     with in_file(photo.path):
         if camera.is_wide:
-            what, fix = (
-                f"no {camera.lens} lens",
-                "undistort the photo, or crop it to a pinhole's view",
-            )
-            raise InputError(f"the annotator takes {what}", where="camera.lens", fix=fix)
+            what = f"the annotator does not support {camera.lens} lenses"
+            fix = "undistort the photo, or crop it to a pinhole's view"
+            raise InputError(what, where="camera.lens", fix=fix)
     return camera
 
 
 def natural_key(name: str) -> tuple[tuple[str, int], ...]:
-    """Key that sorts numbers in names by their values.
+    """Return a key that sorts numbers in names by their values.
 
     Examples
     --------
@@ -122,20 +120,20 @@ def natural_key(name: str) -> tuple[tuple[str, int], ...]:
 
 
 @dataclass(frozen=True)
-class MarkedMask:
-    """A mask: that of a file, or a drawn one, as the bytes of a PNG file."""
+class ObjectMask:
+    """A mask: a file, or a drawn mask as the bytes of a PNG file."""
 
     file: Path | None = None
     sigma: float | None = None  # of its contour [px]
     png: bytes = b""
 
     @classmethod
-    def of(cls, inside: BoolArray) -> MarkedMask:
-        """A drawn mask of pixels (h, w)."""
+    def from_pixels(cls, inside: BoolArray) -> ObjectMask:
+        """Make a drawn mask from pixels (h, w)."""
         return cls(png=cv2.imencode(".png", 255 * inside.astype(np.uint8))[1].tobytes())
 
     def pixels(self, width: int, height: int) -> BoolArray:
-        """The mask (h, w); raises DataError if its file is none of that size."""
+        """Return the mask (h, w); raises DataError if its file has another size."""
         if self.file is None:
             with open_picture(io.BytesIO(self.png), len(self.png), where="mask") as image:
                 return np.asarray(image) > 0
@@ -150,11 +148,11 @@ class MarkedMask:
         return mask
 
 
-def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
+def segment_box(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
     """Segment the object in a box of the photo (h, w, 3) by its colours, by GrabCut.
 
-    ``corners`` (2, 2) are two of the box [px]. Raises InputError if the box is too small, fills the
-    photo, or holds nothing that differs.
+    ``corners`` (2, 2) are opposite corners of the box [px]. Raises InputError if the box is too
+    small, fills the photo, or looks like its surroundings.
 
     Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated graph
     cuts" (2004).
@@ -180,6 +178,6 @@ def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> B
     cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     found = (255 * np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))).astype(np.uint8)
     if not found.any():
-        what = "nothing in the box differs from what is around it"
+        what = "nothing in the box differs from its surroundings"
         raise InputError(what, where="box", fix="draw it closer around the object")
     return np.asarray(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) >= 128)

@@ -1,7 +1,7 @@
-"""The problem behind the live alignment: `cadalign.align` with all that is marked of an object.
+"""Live alignment: `cadalign.align` with all marks of an object.
 
-The standard deviation of the pairs is the one that explains their residuals, so that a model which
-is only similar is not stretched to fit clicks.
+The standard deviation of the pairs is estimated from their residuals, so that a model that is only
+similar to the object is not stretched to fit the clicks.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ from cadalign.shapes.model import ShapeModel
 LEAST_SIGMA = 1.0  # of clicks [px]
 _ROBUST_ROUNDS = 3
 _ROBUST_SHARE = 2.0  # of the median residual
-# Of clicks on natural points of a model that is not quite the object [longer sides of the photo],
-# and the weight of that expectation against residuals, as that of so many equations.
+# Expected noise of clicks on a similar model [longer sides of the photo], and its weight against
+# the residuals, as a number of equations.
 _EXPECTED_NOISE = 0.005
 _NOISE_EQUATIONS = 4
-_FIRST_NOISE = 4.0  # over the expected one
-_MOST_NOISE = 10.0  # the same; what needs more is a mistake, which the residuals then show
+_FIRST_NOISE = 4.0  # times the expected noise
+_MOST_NOISE = 10.0  # times the expected noise; larger residuals are mistakes, and are shown
 _NOISE_ROUNDS = 12
 _NOISE_TOLERANCE = 0.02
 _UNKNOWNS = 8  # of a pose and a stretch
-_LEAST_JUDGED = 6  # pairs of an own shape from which on one can contradict the others
-_CONTRADICTS = 5.0  # distance from the others' prediction [sigmas]; hands click to about 2 px
+_LEAST_JUDGED = 6  # pairs; with fewer, a learned shape has no outliers
+_CONTRADICTS = 5.0  # distance of an outlier from the prediction [sigmas]; clicks have about 2 px
 _FALSE_OUTLIERS = 0.01
-_MOST_ROUNDS = 100  # of a forward search, each of which fits all inliers
-# Hands click to about 2 px, and shapes differ by as much: weight of that, as of so many equations.
+_MOST_ROUNDS = 100  # of a forward search; each fits all inliers
+# Expected noise of clicks and differences of shape [px], and its weight as a number of equations.
 _CLICK, _CLICK_EQUATIONS = 2.0, 4
 _UNSTRETCHED = "The model is shown unstretched: add a pair elsewhere."
 _FOCAL_ASSUMED = "The focal length is assumed: add a pair elsewhere to have it estimated."
 
 Rows = npt.NDArray[np.intp]
 FitRows = Callable[[Rows, bool], Result]
-"""A fit of some rows at a noise of 1 px; with a robust loss if the second argument is True."""
+"""Function that fits some rows at 1 px of noise; with a robust loss if its flag is set."""
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """Knowledge of an object beside its observation.
+class Priors:
+    """Prior knowledge of an object: its shape, mesh and focal length.
 
-    ``focal`` is the likely focal length, at which an unknown one is assumed, and ``focal_prior``
-    the prior on it.
+    ``focal`` is the value that is assumed if the focal length cannot be estimated, ``focal_prior``
+    its prior.
     """
 
     shape: ObjectShape
@@ -83,11 +83,10 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class LiveEstimate:
-    """An alignment of what is marked; a ``message`` says what it assumes beyond that.
+    """An alignment of the marks; ``message`` states its additional assumption.
 
-    ``sigma`` is the pairs' standard deviation [px], ``fit_options`` are those with which `cadalign
-    fit` finds the result, and ``outliers`` the distances [px] of the pairs that contradict the
-    others, by their rows.
+    ``sigma`` is the standard deviation of the pairs [px]. `cadalign fit` finds the same result with
+    ``fit_options``. ``outliers`` are the distances [px] of outlying pairs, by row.
     """
 
     result: Result
@@ -99,31 +98,31 @@ class LiveEstimate:
 
 @dataclass(frozen=True, eq=False)
 class LiveProblem:
-    """Arguments of `cadalign.align`; ``settles`` says that the pairs' noise is to be found."""
+    """Arguments of `cadalign.align`; ``estimates_noise`` if the pairs' noise is estimated."""
 
     model: Model | ShapeModel
     view: View
     size: Size | None = None
-    settles: bool = False
+    estimates_noise: bool = False
     estimates_focal: bool = False
     focal_prior: FocalPrior | None = None
     init: Alignment | None = None
 
     @classmethod
-    def of(cls, known: Known, observation: Observation) -> LiveProblem:
-        """The problem of an observation, with the options of a fit that it holds."""
+    def make(cls, known: Priors, observation: Observation) -> LiveProblem:
+        """Build the problem of an observation and its options."""
         model, has_photo = known.model_for(observation), "image" in observation.fit_options
         estimates_focal = not observation.camera.focal_known
         if estimates_focal:
             observation = replace(observation, camera=observation.camera.with_focal(known.focal))
         (view,) = views_of(observation, model, with_photos=has_photo)
         states_noise = observation.sigma is not None and not observation.is_plain
-        settles = not (known.shape.learned or states_noise) and bool(len(view.keypoint_ids))
+        estimates_noise = not (known.shape.learned or states_noise) and bool(len(view.keypoint_ids))
         focal = estimates_focal, known.focal_prior
-        return cls(model, view, observation.size, settles, *focal, observation.init)
+        return cls(model, view, observation.size, estimates_noise, *focal, observation.init)
 
     def estimate(self) -> LiveEstimate:
-        """Align with as few assumptions as the marks need; raises a CadalignError without."""
+        """Align with as few assumptions as possible; raises a CadalignError if that fails."""
         reason: CadalignError | None = None
         for attempt, message in self._attempts():
             try:
@@ -132,30 +131,32 @@ class LiveProblem:
                 reason = error
                 continue
             has_shape = isinstance(self.model, ShapeModel)
-            judged = attempt.at_focal(result.camera) if has_shape else attempt
-            outliers = judged.contradicting()
+            judged = attempt.fix_focal(result.camera) if has_shape else attempt
+            outliers = judged.outliers()
             return LiveEstimate(result, message, sigma, {} if message else options, outliers)
         assert reason is not None
         raise reason
 
     def _attempts(self) -> Iterator[tuple[LiveProblem, str]]:
-        """Problems to try, the last where marks hardly suffice, and what they assume."""
-        if len(self.view.keypoint_ids) or not self.estimates_focal:  # a mask alone leaves it open
+        """Yield problems to try, and their assumptions; the last ones need the fewest marks."""
+        if (
+            len(self.view.keypoint_ids) or not self.estimates_focal
+        ):  # a mask alone does not determine it
             yield self, ""
-        problem = self.at_focal(self.view.camera)
+        problem = self.fix_focal(self.view.camera)
         if self.estimates_focal:
             yield problem, _FOCAL_ASSUMED
         if isinstance(self.model, Model):
             rigid = replace(self.model, stretch_sigma=None, stretch="none")
             yield replace(problem, model=rigid), _UNSTRETCHED
 
-    def at_focal(self, camera: Camera) -> LiveProblem:
-        """The problem with the focal length of this camera known."""
+    def fix_focal(self, camera: Camera) -> LiveProblem:
+        """Set a known focal length by a camera."""
         view = replace(self.view, camera=camera)
         return replace(self, view=view, estimates_focal=False, focal_prior=None)
 
-    def weighted(self, factor: float) -> LiveProblem:
-        """The problem with each pair's standard deviation times a factor."""
+    def scale_sigma(self, factor: float) -> LiveProblem:
+        """Multiply the standard deviation of each pair by a factor."""
         sigma = factor * cast(FloatArray, self.view.sigma)
         return replace(self, view=replace(self.view, sigma=sigma))
 
@@ -166,21 +167,21 @@ class LiveProblem:
         return align(self.model, self.view, size=self.size, init=self.init, **options)
 
     def solve(self) -> tuple[Result, float, Mapping[str, Any]]:
-        """Align at the noise that is due; with its factor [px] and the options of the fit."""
-        if not self.settles:
+        """Align at the estimated noise; returns also its factor [px] and the options of a fit."""
+        if not self.estimates_noise:
             return self.align(), LEAST_SIGMA, {}
-        factor = self._explaining_noise()
+        factor = self._estimate_noise()
         sigma = factor * np.asarray(self.view.sigma)
         options = {"sigma": sigma.tolist() if sigma.ndim else float(sigma)}
-        return self.weighted(factor).align(), factor, options
+        return self.scale_sigma(factor).align(), factor, options
 
-    def contradicting(self) -> dict[int, float]:
-        """Distances [px] of the pairs that contradict the others, by their rows."""
+    def outliers(self) -> dict[int, float]:
+        """Return the distances [px] of outlying pairs, by row."""
         view, model = self.view, self.model
         alone = View(view.camera, view.points_2d, ids=view.ids, sigma=view.sigma)
         pairs = replace(self, view=alone, size=None, init=None)
         if isinstance(model, ShapeModel):
-            return pairs._left_out()
+            return pairs._robust_outliers()
         rows = {each: row for row, each in enumerate(model.ids or ())}
         points = np.asarray(model.points_3d)[[rows[each] for each in view.keypoint_ids]]
         unknowns = _UNKNOWNS + self.estimates_focal
@@ -197,11 +198,11 @@ class LiveProblem:
             # sigma=None iterates until nothing changes, which takes ten times as long.
             median = float(np.median(np.linalg.norm(result.residuals, axis=1)))
             sigma = max(LEAST_SIGMA, median / _ROBUST_SHARE)
-            result = alone.weighted(sigma).align(loss="cauchy")
+            result = alone.scale_sigma(sigma).align(loss="cauchy")
         return result
 
-    def _left_out(self) -> dict[int, float]:
-        """Distances [px] of the pairs that a robust search leaves out."""
+    def _robust_outliers(self) -> dict[int, float]:
+        """Return the residuals [px] of the outliers of a robust search, by row."""
         if len(self.view.keypoint_ids) < _LEAST_JUDGED:
             return {}
         try:
@@ -211,27 +212,27 @@ class LiveProblem:
         lengths = np.linalg.norm(robust.residuals, axis=1)
         return {int(row): float(lengths[row]) for row in np.flatnonzero(~robust.inliers)}
 
-    def _explaining_noise(self) -> float:
-        """The factor of the pairs' standard deviations that explains the residuals [px].
+    def _estimate_noise(self) -> float:
+        """Estimate the factor of the pairs' standard deviations from the residuals [px].
 
-        It is the fixed point of its estimate, reached from above, so that residuals first count as
-        noise, and as a stretch only where the noise does not explain them.
+        The factor converges from above: residuals first count as noise, and only as stretch if the
+        noise does not explain them.
         """
         view = self.view
         expected = _EXPECTED_NOISE * max(view.camera.width, view.camera.height)
         factor = _FIRST_NOISE * expected
-        # Without mask and photo and with the focal length of the first round, which take long.
+        # Without mask and photo, and with the focal length of the first round, to save time.
         near = replace(self, view=replace(view, mask=None, mask_sigma=None, image=None))
         sigma = np.reshape(cast(FloatArray, view.sigma), (-1, 1))
         for _ in range(_NOISE_ROUNDS):
             try:
-                result = near.weighted(factor).align()
+                result = near.scale_sigma(factor).align()
             except CadalignError:
                 if view.mask is None and view.image is None:
                     raise
-                return expected  # it takes the outline
+                return expected  # the pairs alone do not suffice
             if near.estimates_focal:
-                near = near.at_focal(result.camera)
+                near = near.fix_focal(result.camera)
             before, redundancy = factor, max(0, 2 * len(result.residuals) - _UNKNOWNS)
             squares = float(((result.residuals / sigma) ** 2).sum())
             factor = math.sqrt(
@@ -250,11 +251,11 @@ def find_outliers(
     A forward search (Hadi, "Identifying multiple outliers in multivariate data", 1992): it begins
     with the better half of the keypoints in a robust fit and adds all that agree, until nothing
     changes, so that several outliers do not mask each other. The noise is estimated from the
-    inliers, about that of clicks, since all keypoints of a model that is only similar to the object
-    are some pixels off.
+    inliers, since all keypoints of a model that is only similar to the object are some pixels off.
 
-    Returns, by row, the outlier's distance [px] from the prediction of the fit to the inliers; none
-    with too few keypoints: without one, at least two more equations than unknowns must be left.
+    Returns, by row, the distance [px] of each outlier from the fit to the inliers. With too few
+    keypoints there are no outliers: a fit to the others needs at least two more equations than
+    unknowns.
     """
     count, least = len(points_3d), unknowns // 2 + 1
     if count <= least:
@@ -294,7 +295,7 @@ def find_outliers(
     try:
         robust = residuals_of(fit_rows(np.arange(count), True))
         rows, known = nearest((robust**2).sum(axis=1)), set[bytes]()
-        # The search may come back to a set instead of coming to rest.
+        # The search may cycle instead of converging.
         while rows.tobytes() not in known and len(known) < _MOST_ROUNDS:
             known.add(rows.tobytes())
             values, quantile = statistic(rows)
@@ -304,14 +305,14 @@ def find_outliers(
         if not len(outliers):
             return {}
         lengths = np.linalg.norm(residuals_of(fit_rows(rows, False)), axis=1)
-    except CadalignError:  # a subset of the keypoints is degenerate, so that none can be judged
+    except CadalignError:  # a subset is degenerate: no keypoint can be judged
         return {}
     return {int(row): float(lengths[row]) for row in outliers}
 
 
 @cache
 def warm_up(*, joint: bool) -> None:
-    """Compile or load what alignments call, once in a process, by aligning synthetic problems."""
+    """Compile or load the solvers, once per process, by aligning synthetic problems."""
     problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
     view = View(problem.camera, problem.points_2d, sigma=1.0)
     prior = FocalPrior(problem.camera.fx, 0.4)

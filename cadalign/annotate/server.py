@@ -1,4 +1,4 @@
-"""Web server of the annotator: page, photos, model and actions, for the session's token alone."""
+"""Web server of the annotator: page, photos, model and actions; requests need a token."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
             # Another site's name may resolve to this machine (DNS rebinding).
             Middleware(TrustedHostMiddleware, allowed_hosts=_NAMES),
         ],
-        exception_handlers={CadalignError: _refused},
+        exception_handlers={CadalignError: _refusal},
     )
 
 
@@ -184,11 +184,11 @@ class _Routes:
         return JSONResponse(photos_state(self._session))
 
     def photo(self, request: Request) -> Response:
-        kind, data = self._annotation(request).photo.encoded()
+        kind, data = self._annotation(request).photo.encode()
         return Response(data, media_type=kind)
 
     def mask(self, request: Request) -> Response:
-        # Its opacity is what the page draws, in a colour of its own.
+        # The page draws the opacity in its own colour.
         opacity = np.where(self._annotation(request).mask, 255, 0).astype(np.uint8)
         data = io.BytesIO()
         Image.fromarray(np.stack([np.zeros_like(opacity), opacity], axis=2), "LA").save(data, "PNG")
@@ -208,9 +208,9 @@ class _Routes:
             raise InputError("not JSON", where="body", fix=fix) from None
         if not isinstance(action, dict):
             raise InputError("not a JSON object", where="body", fix=fix)
-        return await run_in_threadpool(self._acted, request.path_params["number"], action)
+        return await run_in_threadpool(self._perform, request.path_params["number"], action)
 
-    def _acted(self, number: int, action: dict[str, Any]) -> Response:
+    def _perform(self, number: int, action: dict[str, Any]) -> Response:
         with self._session.lock:
             outcome = perform(self._session, number, action)
             return JSONResponse(page_state(self._session, number, outcome))
@@ -223,5 +223,5 @@ def _asset(name: str, media_type: str, request: Request) -> Response:
     return Response(asset(name), media_type=media_type)
 
 
-async def _refused(request: Request, error: Exception) -> Response:
+async def _refusal(request: Request, error: Exception) -> Response:
     return PlainTextResponse(str(error), status_code=422)

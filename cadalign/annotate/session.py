@@ -18,10 +18,10 @@ from cadalign.annotate.files import (
     refuse_collisions,
 )
 from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel, positions_of
-from cadalign.annotate.model import OpenedModel, Wireframe, open_model
+from cadalign.annotate.model import AnnotatedModel, Wireframe, open_model
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS, ObservationFile
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
-from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem, warm_up
+from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors, warm_up
 from cadalign.arrays import BoolArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
@@ -30,19 +30,19 @@ from cadalign.io.observation import Observation, read_camera
 
 logger = logging.getLogger("cadalign")
 
-_LEAST_PAIRS = 4  # of an alignment without evidence beside them
+_LEAST_PAIRS = 4  # of an alignment without further evidence
 
 
 @dataclass(frozen=True, eq=False)
 class LiveAlignment:
-    """Alignment of what is marked so far; without one a message says why."""
+    """Alignment of the current marks, or a message why there is none."""
 
     estimate: LiveEstimate | None = None
     message: str = ""
     counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
-    """(n,), the complete pairs that count."""
+    """Mask (n,) of the complete pairs that count."""
     wireframe: Wireframe | None = None
-    """Lines of the model, warped to an own shape, in its frame before the stretch."""
+    """Lines of the model before the stretch, warped to a learned shape."""
 
     @property
     def result(self) -> Result | None:
@@ -51,9 +51,9 @@ class LiveAlignment:
 
 
 def missing_text(counts: BoolArray, shape: ObjectShape, observation: Observation) -> str:
-    """Say how many more pairs the first alignment needs; empty if none.
+    """Return a text about how many more pairs the first alignment needs; empty if none.
 
-    ``counts`` (n,) are the complete pairs that count.
+    ``counts`` (n,) is the mask of complete pairs that count.
     """
     if shape.learned is None and (observation.evidence.mask or observation.init):
         return ""
@@ -69,16 +69,16 @@ def missing_text(counts: BoolArray, shape: ObjectShape, observation: Observation
 
 @dataclass(eq=False)
 class Annotation:
-    """The object in a photo: its file, its marks, and what the last save and alignment gave."""
+    """The object in a photo: its file, its marks, its last alignment, and errors of saving."""
 
     file: ObservationFile
     history: History
     save_error: str = ""
     is_pending: bool = False
-    """True if it was saved before the solvers were ready, so without what they find."""
+    """True if it was saved before the solvers were ready, without the estimated noise."""
     live: tuple[Marks, LiveAlignment] | None = None
     """The last alignment, with its marks."""
-    _estimated: tuple[str, LiveEstimate] | None = None  # with what it depends on
+    _estimated: tuple[str, LiveEstimate] | None = None  # with a key of its input
 
     @property
     def marks(self) -> Marks:
@@ -91,7 +91,7 @@ class Annotation:
         return self.file.photo
 
     @property
-    def model(self) -> OpenedModel:
+    def model(self) -> AnnotatedModel:
         """The model of the session."""
         return self.file.model
 
@@ -101,7 +101,7 @@ class Annotation:
         return self.file.shape
 
     def record(self, marks: Marks) -> None:
-        """Go on to other marks."""
+        """Set the current marks."""
         self.history.record(marks)
 
     @property
@@ -111,7 +111,7 @@ class Annotation:
         return np.zeros((height, width), bool) if mask is None else mask.pixels(width, height)
 
     def require_inside(self, uv: Pixel) -> None:
-        """Refuse a place outside the photo."""
+        """Raise InputError for a place outside the photo."""
         if not self.marks.camera.contains(np.array([uv]))[0]:
             what = f"({uv[0]:.1f}, {uv[1]:.1f}) is outside the photo"
             raise InputError(what, where="uv", fix="place it inside")
@@ -124,34 +124,34 @@ class Annotation:
                 live = self._align()
             except DegenerateError as error:
                 live = LiveAlignment(message=f"No alignment yet: {error.what}.")
-            except CadalignError as error:  # also of a mask that cannot be written or read
+            except CadalignError as error:  # for example a mask that cannot be read or written
                 live = LiveAlignment(message=f"No alignment: {error}.")
             self.live = marks, live
         return self.live[1]
 
     def _align(self) -> LiveAlignment:
         file, marks, shape = self.file, self.marks, self.shape
-        observation, counting = file.observation_of(marks), file.counting(marks)
+        observation, counting = file.observation_of(marks), file.usable_pairs(marks)
         counts = np.array([pair in counting for pair in marks.complete_pairs], dtype=bool)
         if missing := missing_text(counts, shape, observation):
             return LiveAlignment(message=missing)
         estimate, lines = self._estimate(observation), self.model.cad.wireframe
-        if shape.learned is not None:  # warped such that known keypoints come to the estimated ones
+        if shape.learned is not None:  # move known keypoints to their estimates
             result = estimate.result
             registry = self.model.registry
             own: dict[Any, ModelKeypoint] = {shape.id_of(point): point for _, point in registry}
             rows = [row for row, label in enumerate(result.ids) if label in own]
             source = positions_of(own[result.ids[row]] for row in rows)
-            lines = lines.warped(source, result.points_3d[rows], result.bounds)
+            lines = lines.warp(source, result.points_3d[rows], result.bounds)
         return LiveAlignment(estimate, "", counts, lines)
 
     def _estimate(self, observation: Observation) -> LiveEstimate:
         depends = replace(observation, unfinished=None).to_dict()
-        key = json.dumps([depends, hash(self.marks.mask)])  # whose file is written anew
+        key = json.dumps([depends, hash(self.marks.mask)])  # a mask's path may stay the same
         if self._estimated is None or self._estimated[0] != key:
             mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
-            known = Known(self.shape, mesh, likely, self.file.focal_prior)
-            self._estimated = key, LiveProblem.of(known, observation).estimate()
+            known = Priors(self.shape, mesh, likely, self.file.focal_prior)
+            self._estimated = key, LiveProblem.make(known, observation).estimate()
         return self._estimated[1]
 
 
@@ -159,7 +159,7 @@ class Annotation:
 class Session:
     """All state of an annotator; safe to use from several threads."""
 
-    model: OpenedModel
+    model: AnnotatedModel
     shape: ObjectShape = field(default_factory=ObjectShape)
     photos: list[Annotation] = field(default_factory=list)
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
@@ -169,7 +169,7 @@ class Session:
         self.ended = threading.Event()
 
     def warm_up(self) -> None:
-        """Compile or load the solvers, and prepare the model, until the session has ``ended``."""
+        """Compile or load the solvers, and prepare the model, unless the session has ``ended``."""
         try:
             joint = self.shape.learned is not None or any(
                 not each.file.observation_of(each.marks).is_plain
@@ -187,7 +187,7 @@ class Session:
                         self.save(each)
 
     def annotation(self, number: int) -> Annotation:
-        """The annotation of a number, counted from 0."""
+        """Return the annotation of a number, from 0; raises InputError if there is none."""
         if not 0 <= number < len(self.photos):
             raise InputError(f"there is no photo {number + 1}", where="image")
         return self.photos[number]
@@ -201,7 +201,7 @@ class Session:
     def save(self, annotation: Annotation) -> None:
         """Write the files of an annotation and of the model; an error is kept for the page.
 
-        Those that could not be written before are written too.
+        Also writes annotations that could not be written before.
         """
         self._write(annotation)
         if not annotation.save_error:
@@ -213,18 +213,18 @@ class Session:
         return [each for each in self.photos if each.save_error]
 
     def save_unsaved(self) -> None:
-        """Write what could not be written."""
+        """Write all annotations that could not be written."""
         with self.lock:
             for each in self.unsaved:
                 self._write(each)
 
     def _write(self, annotation: Annotation) -> None:
-        annotation.is_pending = not self.ready  # asked first: it may become so at any time
+        annotation.is_pending = not self.ready  # read first: it may change at any time
         estimate = self.live(annotation).estimate
         options = {} if estimate is None else estimate.fit_options
         used = (each.marks.keypoints for each in self.photos)
         try:
-            # First the keypoints, which the observation names.
+            # Keypoints first: the observation refers to them.
             self.model.write_keypoints(frozenset[int]().union(*used))
             file = annotation.file
             file.write(file.observation_of(annotation.marks, sigma=options))
@@ -239,15 +239,15 @@ SessionFiles = list[tuple[PhotoFile, Path]]
 
 
 def find_session_files(options: SessionOptions) -> SessionFiles:
-    """Find the photos and name their files; raises an error where files would collide."""
+    """Find the photos and name their files; raises InputError if files would collide."""
     image, given = options.image, options.observation
     paths = find_photos(image)
     if given is not None and (image.is_dir() or options.out is not None):
         what = "names the file of a single photo, but a folder is given too"
         fix = "use --out for a folder of photos, and not both options"
         raise InputError(what, where="--observation", fix=fix)
-    photos = _readable(paths) if image.is_dir() else [PhotoFile.open(paths[0])]
-    photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
+    photos = _open_photos(paths) if image.is_dir() else [PhotoFile.open(paths[0])]
+    photos[0].encode()  # refuses a damaged photo now, not when the page asks for it
     out = options.out or paths[0].parent if given is None else given.parent
     observations = [] if given is None else [given]
     for photo in photos[len(observations) :]:
@@ -278,8 +278,8 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
     return session
 
 
-def _readable(paths: list[Path]) -> list[PhotoFile]:
-    """Open the files that are photos, with a warning about the others."""
+def _open_photos(paths: list[Path]) -> list[PhotoFile]:
+    """Open the photos; logs a warning for each file that cannot be read."""
     photos = []
     for path in paths:
         try:

@@ -1,4 +1,4 @@
-"""Many observations aligned as a run: what goes in, and the table that comes out."""
+"""Alignment of many observations as a run."""
 
 from typing import TYPE_CHECKING
 

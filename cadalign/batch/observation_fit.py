@@ -1,6 +1,6 @@
-"""Observations as problems of `cadalign.fit` and `cadalign.align`: options, model and views.
+"""Alignment of one observation by `cadalign.fit` or `cadalign.align`: options, model and views.
 
-`cadalign fit` and runs over many observations align each in this way.
+`cadalign fit` and runs over many observations use it.
 """
 
 from __future__ import annotations
@@ -31,47 +31,48 @@ if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel
     from cadalign.shapes.parts import KeypointId
 
-_NOT_OF_FIT = ("shape_sigma", "image")  # stored options that are not of `FitOptions`
+_NOT_OF_FIT = ("shape_sigma", "image")  # stored options that `FitOptions` lacks
 _STORED = ("sigma", "method", "loss", "stretch", "shape_sigma", "focal")
 Note = Callable[[str], object]
-"""What is told about an estimate, such as the source of its focal length."""
+"""Function called with notes on an estimate, such as the source of a focal length prior."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationFit:
-    """Settings of an observation's alignment, in the place of those that its file stores."""
+    """Settings of an alignment; they override the settings that the observation file stores."""
 
     sigma: float | Literal["none"] | None = None
-    """Standard deviation of the keypoints [px], by default the file's, or 1; none: estimated from
-    the residuals."""
+    """Standard deviation of the keypoint noise [px], or none to estimate it from the residuals; by
+    default the file's value, or 1."""
     similar: bool = False
-    """For a model that is only similar to the object: sigma is none unless it is given, and
-    proportions are expected within 20 % of the model's, unless the file says otherwise."""
+    """The model is only similar to the object: estimate sigma unless it is given, and expect
+    proportions within 20 % of the model's unless the file has a stretch_sigma."""
     robust: bool = False
-    """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
+    """Find outliers among the keypoints by RANSAC, and fit only the inliers."""
     shape: Path | None = None
-    """File of `cadalign shape learn`: estimate the object's own shape, of that category, in place
-    of a stretch. Keypoints need the shape's semantic ids or names, and no xyz."""
+    """Shape file of `cadalign shape learn`: estimate the object's own shape within its category,
+    instead of a stretch. Keypoints need the shape's semantic ids or names, but no xyz."""
     shape_sigma: float | None = None
-    """Estimate the object's own shape from the model's: standard deviation of the keypoints'
-    positions on the object about those on the stretched model [model units]."""
+    """Estimate the object's own shape as a deviation from the stretched model, with this standard
+    deviation of each keypoint's position [model units]."""
     use_photo: bool = False
-    """Take the photo itself as evidence: the model's outline is sought in it, from the estimate by
-    everything else. The model needs a mesh."""
+    """Use the photo itself as evidence: search it for the model's outline, starting at the estimate
+    from all other evidence. The model needs a mesh."""
     focal: Literal["known", "estimate"] | None = None
-    """Focal length: known (the file's) or estimate; by default known, if every view has one."""
+    """Whether the focal length is known or to be estimated; by default known if all views have
+    one."""
     method: str | None = None
-    """Solver: optimal (maximum likelihood, searched globally; the default), aepnp (linear),
-    aepnp-paper (linear, as published) or epnp (OpenCV's, without stretch)."""
+    """Solver: optimal (maximum likelihood by global search; the default), aepnp (linear),
+    aepnp-paper (linear, as published) or epnp (OpenCV, without stretch)."""
     loss: str | None = None
-    """Loss on the length of a residual: linear (squared; the default), huber or cauchy; the robust
-    ones tolerate outliers."""
+    """Loss on the length of a residual: linear (squared error; the default), or huber or cauchy,
+    which tolerate outliers."""
     stretch: str | None = None
-    """Axes whose scale is estimated: yz by default; y, z or none."""
+    """Axes whose scale is estimated: yz (the default), y, z or none."""
 
     @property
     def given(self) -> dict[str, Any]:
-        """Options that are given, as the entry ``fit`` of an observation's file has it."""
+        """The options that are set, in the form of the field ``fit`` of an observation file."""
         values = {name: getattr(self, name) for name in _STORED}
         given = {name: value for name, value in values.items() if value is not None}
         if self.sigma == "none" or (self.similar and self.sigma is None):
@@ -90,29 +91,29 @@ class ObservationFit:
     def read(
         self, data: Any, where: str, *, folder: Path | None, changes: ObservationChanges
     ) -> Observation:
-        """Read the parsed form of an observation, with changes; ``where`` is its name in messages.
+        """Build an observation from parsed JSON, and change its camera.
 
-        Where a learned shape is fitted, keypoints need no ``xyz``.
+        ``where`` names it in messages. With a learned shape, keypoints need no ``xyz``.
         """
         needs_xyz = None if self.shape is None and self.shape_sigma is None else self.shape is None
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
-        return changes.applied_to(seen, where)  # whose errors name options
+        return changes.applied_to(seen, where)  # outside of `in_file`: errors name options
 
     def changed(self, seen: Observation) -> Observation:
-        """The observation with what is given in the place of what it stores.
+        """Override the stored settings of an observation by the options that are set.
 
-        Raises InputError if that has no effect together with a shape or further evidence.
+        Raises InputError if an option has no effect with a shape or with further evidence.
         """
         given, stored, shape = self.given, dict(seen.fit_options), seen.shape
         if self.shape is not None or self.shape_sigma is not None:
             if self.shape is not None and self.shape_sigma is not None:
-                what = "`shape` has learned how far objects of the category differ"
+                what = "has no effect together with a learned shape"
                 raise InputError(what, where="shape_sigma", fix="give one of the two options")
             shape = self.shape
             stored.pop("shape_sigma", None)
         options = stored | given
-        # Nothing is checked anew: in runs that takes as long as a linear solver.
+        # Skips the checks of the observation, which take as long as a linear solver.
         fields = {"shape": shape and shape.absolute(), "fit_options": options}
         changed = quickly(Observation, vars(seen) | fields)
         if not _is_plain(changed):
@@ -134,10 +135,10 @@ class ObservationFit:
                 raise InputError(what, where=name, fix=fix)
 
     def fit(self, seen: Observation, where: str, *, note: Note = lambda text: None) -> Result:
-        """Align an observation that is `changed`; ``where`` is its name in messages.
+        """Align an observation that `changed` has returned; ``where`` names it in messages.
 
-        ``note`` is called with what is left out, and the source of a focal length. Raises
-        CadalignError if options or observation are invalid, or there is no alignment.
+        ``note`` is called with the keypoints that are left out, and the prior on a focal length.
+        Raises CadalignError if an option or the observation is invalid, or if no alignment exists.
         """
         for view in seen.views:
             if view.text_of_not_found:
@@ -154,7 +155,7 @@ class ObservationFit:
         return self._align(seen, where, options)
 
     def _options(self, seen: Observation, where: str, note: Note) -> FitOptions:
-        """Options of the fit, with the standard deviation and focal length that are known."""
+        """Build the options of the fit, with the standard deviation and the focal length prior."""
         given = {name: each for name, each in seen.fit_options.items() if name not in _NOT_OF_FIT}
         are_known = all(view.camera.focal_known for view in seen.views)
         focal = given.setdefault("focal", "known" if are_known else "estimate")
@@ -164,9 +165,9 @@ class ObservationFit:
         prior = _prior_for(seen, note) if focal == "estimate" else None
         if prior is not None:
             shown = prior_of_camera(prior, seen.camera)
-            note(f"Focal length is estimated, its prior: {shown}")
+            note(f"The focal length is estimated with the prior {shown}")
         given.setdefault("sigma", 1.0 if seen.sigma is None else seen.sigma)
-        with self._located(where, "fit"):
+        with self._locate_errors(where, "fit"):
             return FitOptions(**given | {"focal_prior": prior})
 
     def _fit_keypoints(self, seen: Observation, options: FitOptions) -> Result:
@@ -183,18 +184,18 @@ class ObservationFit:
             return fit_one(problem, options, *search, seen.labels, seen.image)
 
     def _align(self, seen: Observation, where: str, options: FitOptions) -> Result:
-        """Align all evidence of an observation."""
+        """Align a model to all evidence of an observation."""
         from cadalign.estimation.align import align
 
         model, given = self._model(seen, where, options), seen.fit_options
         has_photos = bool(given.get("image"))
         if has_photos and all(image.image is None for image in seen.views):
-            fix = "write its path as image into the file, or leave the option away"
+            fix = "add its path as the field image, or leave out the option"
             raise InputError("the observation names no photo", where="use_photo", fix=fix)
         with in_file(where):
             stated = {"sigma": given["sigma"]} if "sigma" in given else {}
             views = views_of(seen, model, with_photos=has_photos, **stated)
-        with self._located(where):
+        with self._locate_errors(where):
             return align(
                 model,
                 views,
@@ -214,15 +215,15 @@ class ObservationFit:
             if seen.symmetry is not None:
                 what, place = "has no effect together with a learned shape", f"{where}: symmetry"
                 raise InputError(what, where=place, fix="leave out one of the two")
-            return opened_shape(self.shape or seen.shape)  # as it was named
+            return open_shape(self.shape or seen.shape)  # errors name the option's path
         mesh = None if seen.model is None else mesh_at(seen.model)
         sigma = seen.fit_options.get("shape_sigma")
-        with self._located(where):
+        with self._locate_errors(where):
             return model_of(seen, options=options, shape_sigma=sigma, mesh=mesh)
 
     @contextmanager
-    def _located(self, where: str, part: str = "") -> Iterator[None]:
-        """Let errors about arguments name the option, or else the observation, and its part."""
+    def _locate_errors(self, where: str, part: str = "") -> Iterator[None]:
+        """Locate errors about arguments: at an option that is set, otherwise in the observation."""
         try:
             yield
         except InputError as error:
@@ -233,7 +234,7 @@ class ObservationFit:
 
 
 def _is_plain(seen: Observation) -> bool:
-    """True where a stretched model is fitted to the keypoints of one image, and to nothing else."""
+    """True if a stretched model is fitted only to the keypoints of one image."""
     given = seen.fit_options
     is_exact = seen.shape is None and given.get("shape_sigma") is None
     return seen.is_plain and is_exact and not given.get("image")
@@ -246,10 +247,10 @@ def model_of(
     shape_sigma: float | None = None,
     mesh: Mesh | None = None,
 ) -> Model:
-    """The model of an observation's own keypoints, those of all its views.
+    """Build the model of the keypoints of all views of an observation.
 
-    Of the options the stretch and the prior on it count. Raises InputError if views
-    place the same keypoint at different points of the model.
+    Uses the stretch of the options and its prior. Raises InputError if two views place a keypoint
+    at different points of the model.
     """
     from cadalign.estimation.model import Model  # not for help of a command
 
@@ -259,9 +260,9 @@ def model_of(
         for row, (name, xyz) in enumerate(zip(names, view.points_3d.tolist(), strict=True)):
             if points.setdefault(name, tuple(xyz)) != tuple(xyz):
                 raise InputError(
-                    f"differs from that of keypoint {name!r} in a view before",
+                    f"differs from the xyz of keypoint {name!r} in an earlier view",
                     where=f"views[{number}].keypoints[{row}].xyz",
-                    fix="give the same point of the model",
+                    fix="give the same xyz in all views",
                 )
     return Model(
         points_3d=list(points.values()),
@@ -282,13 +283,14 @@ def views_of(
     with_photos: bool = False,
     **stated: Sigma | None,
 ) -> tuple[View, ...]:
-    """Evidence of an observation's images about a model, at a stated ``sigma`` or at its own [px].
+    """Build the views of an observation for `cadalign.align`.
 
-    A learned shape's keypoints are found by semantic id or by name, as the shape has them; a sigma
-    is 1 where none is known. Photos themselves are evidence where these are asked for.
+    The standard deviation is a stated ``sigma`` [px], otherwise the image's own, otherwise 1. The
+    keypoints of a learned shape are found by semantic id or name. With ``with_photos``, the photos
+    themselves are evidence.
 
-    Raises InputError if the shape has no such keypoints, the observation has no ids or names, one
-    occurs twice, or what is said of an image is invalid; DataError if a file cannot be read.
+    Raises InputError if the shape lacks a keypoint, the observation has no ids or names, an id
+    occurs twice, or evidence of an image is invalid; DataError if a file cannot be read.
     """
     from cadalign.estimation.view import View
     from cadalign.shapes.model import ShapeModel
@@ -316,7 +318,7 @@ def views_of(
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
-    """The ids, or names, by which a learned shape knows an image's keypoints; see `views_of`."""
+    """Return the ids or names of an image's keypoints in a learned shape; see `views_of`."""
     if not len(image.points_2d):
         return ()
     named = isinstance(shape.ids[0], str)
@@ -326,7 +328,7 @@ def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]
         raise InputError(
             f"the keypoints have no {field}",
             where="keypoints",
-            fix=f"the shape of {shape.category} knows its keypoints by their {kind}",
+            fix=f"the shape of {shape.category} identifies its keypoints by their {kind}",
         )
     ids = tuple(each if named else int(each) for each in given)
     shape.rows(ids, where=f"keypoints.{field}")
@@ -334,9 +336,10 @@ def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]
 
 
 def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:
-    """Labels of the images' keypoints by which they are the same in several.
+    """Label the keypoints of all images; a keypoint has the same label in every image.
 
-    Ids or names where these distinguish all; otherwise numbers, in several images of equal ``xyz``.
+    Labels are the ids or the names if they are unique in each image. Otherwise they are numbers,
+    and keypoints of several images with equal ``xyz`` share a number.
     """
     for field in ("ids", "names"):
         columns = [getattr(each, field) if len(each.points_2d) else () for each in images]
@@ -355,17 +358,17 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
 
 
 @once_per_file(4)
-def opened_shape(path: Path) -> ShapeModel:
-    """Open a learned shape, which runs use again and again."""
+def open_shape(path: Path) -> ShapeModel:
+    """Open a learned shape; a run opens its file once."""
     from cadalign.shapes.model import ShapeModel
 
     return ShapeModel.open(path)
 
 
 def _prior_for(seen: Observation, note: Note) -> PriorOption:
-    """The prior on a focal length: the stored one, or that of the photos, or of usual lenses.
+    """Return the focal length prior: the stored prior, or from EXIF data, or for usual lenses.
 
-    Photos whose EXIF data differ tell none.
+    EXIF data are not used if they differ between the photos.
     """
     if "focal_prior" in seen.fit_options:
         prior = seen.fit_options["focal_prior"]
@@ -375,6 +378,6 @@ def _prior_for(seen: Observation, note: Note) -> PriorOption:
     for other in found[1:]:
         if not found[0].is_like(other):
             focals = f"{found[0].focal:.4g} and {other.focal:.4g} px"
-            note(f"The photos' EXIF data differ ({focals}): unused")
+            note(f"The photos' EXIF focal lengths differ ({focals}): not used")
             return USUAL
     return found[0] if found else USUAL

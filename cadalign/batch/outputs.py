@@ -1,8 +1,8 @@
-"""Outputs of runs over many observations: their tables, and pictures for the page.
+"""Outputs of runs over many observations: tables, and pictures for the page.
 
-The table is ``results.parquet``, and the same as ``results.csv``; docs/how_to/many_photos.md
-describes the columns. Rows are in the order of the observations. Pose
-and camera of several views are the first's.
+The table is written as ``results.parquet`` and ``results.csv``; docs/how_to/many_photos.md
+describes its columns. Rows have the order of the observations. For several views, pose and camera
+belong to the first.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ COLUMNS: Columns = (
     *RESULT_COLUMNS,
 )
 RECORD_COLUMNS: Columns = (("row", int), ("observation", str), ("result", str))
-"""As JSON the result, for pages and `cadalign.Results.open`, or the observation that has none."""
-WARNED = {"warning_kinds": "with warnings", "uncertain": "uncertain"}
-"""Columns that list what is said of a row, by name."""
-# Several times as fast as the standard library's; numbers that are not finite become null.
+"""The result as JSON, for pages and `cadalign.Results.open`; the observation if it failed."""
+WARNING_COLUMNS = {"warning_kinds": "with warnings", "uncertain": "uncertain"}
+"""Columns that list the warnings of a row, with their labels."""
+# Several times faster than the standard library. Non-finite numbers become null.
 _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 
 
 def json_of(data: Any) -> bytes:
-    """Parsed JSON as one line; numbers and texts may be NumPy's."""
+    """Encode plain data as one line of JSON; NumPy scalars are allowed."""
     return _ENCODER.encode(data)
 
 
-def naming_row(row: int, source: str, observation: Observation | None) -> Row:
-    """The cells that name an observation, None where it cannot be read."""
+def name_cells(row: int, source: str, observation: Observation | None) -> Row:
+    """Return the cells that name an observation; it is None if it cannot be read."""
     image = model = name = ""
     if observation is not None:
         image = "" if observation.image is None else str(observation.image)
@@ -62,14 +62,14 @@ def naming_row(row: int, source: str, observation: Observation | None) -> Row:
 
 
 def result_row(result: Result) -> Row:
-    """The cells of a result, and its record without its time, on which no two runs agree."""
+    """Return the cells and the record of a result, without its time, which differs between runs."""
     data = result.to_dict()
     data["stats"]["seconds"] = 0.0
     return row_of(result) | {"observation": "", "result": json_of(data).decode()}
 
 
 def write_csv(folder: RunFolder) -> None:
-    """Write ``results.csv`` of a finished run, holding few rows at a time."""
+    """Write ``results.csv`` of a finished run, a few rows at a time."""
 
     def write(unfinished: Any) -> None:
         with pa_csv.CSVWriter(unfinished, pq.read_schema(folder.results)) as writer:
@@ -80,23 +80,23 @@ def write_csv(folder: RunFolder) -> None:
 
 
 def warnings_text(table: pa.Table) -> str:
-    """Counts of a table's rows with warnings, by kind, and of those with something uncertain."""
-    said = []
-    for column, label in WARNED.items():
+    """Count the rows with warnings and the rows with uncertain quantities, by kind."""
+    parts = []
+    for column, label in WARNING_COLUMNS.items():
         rows = [{*cell.split("; ")} for cell in table[column].to_pylist() if cell]
         of_each = Counter(sorted(name for row in rows for name in row)).most_common()
         if rows:
             listed = ", ".join(f"{name} {count:,}" for name, count in of_each)
-            said.append(f"{len(rows):,} {label}: {listed}")
-    return "; ".join(said)
+            parts.append(f"{len(rows):,} {label}: {listed}")
+    return "; ".join(parts)
 
 
-NAMING = ("row", "source", "image", "object", "model", "match_category", "match_id")
-"""Columns that `page_names` looks at; only a retrieval has the last ones."""
+NAME_COLUMNS = ("row", "source", "image", "object", "model", "match_category", "match_id")
+"""Columns that `page_names` reads; only a retrieval has the last two."""
 
 
 def page_names(row: Row) -> Row:
-    """Names of an observation on the page, unique by its number in the run."""
+    """Name an observation on the page; the number of its row makes the name unique."""
     parts = Path(row["image"] or row["source"]).name, row["object"], f"row {row['row']}"
     model = Path(row["model"]).stem.removesuffix(".keypoints") or "no model"
     category = row.get("match_category") or model
@@ -106,7 +106,7 @@ def page_names(row: Row) -> Row:
 def draw_fit(
     folder: RunFolder, row: Row, seen: Observation, result: Result | None
 ) -> tuple[str, ...]:
-    """Write the pictures of an observation, aligned or not; says what could not be drawn.
+    """Write the pictures of an observation, aligned or not; returns messages about failures.
 
     Raises AbortError if a picture cannot be written, as on a full disk.
     """

@@ -1,4 +1,4 @@
-"""Retrieval for many observations as a run: the tables are those of each one's best match.
+"""Retrieval for many observations as a run; a row of the table holds the best match.
 
 docs/how_to/many_photos.md describes the further columns.
 """
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
-from cadalign.batch.runs import Estimated, FitRunOptions
+from cadalign.batch.runs import Estimate, FitRunOptions
 from cadalign.batch.spec import SPEC as FIT_SPEC
 from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.evaluation.runs.work import Columns
@@ -19,7 +19,7 @@ from cadalign.retrieval.query import ObservationRetrieval
 
 @dataclass(frozen=True, kw_only=True)
 class RetrieveRunOptions(FitRunOptions):
-    """A run that retrieves the models of many observations; see `FitRunOptions`."""
+    """Options of a run that retrieves the models of many observations; see `FitRunOptions`."""
 
     experiment: ClassVar[str] = "retrieve"
     command: ClassVar[str] = "retrieve"
@@ -28,7 +28,7 @@ class RetrieveRunOptions(FitRunOptions):
         *(("match_log_likelihood", float), ("none_probability", float)),
         *(("missing", int), ("matches", str)),
     )
-    threads: ClassVar[int] = -1  # the search lets go of the interpreter lock
+    threads: ClassVar[int] = -1  # the search releases the interpreter lock
 
     estimate: ObservationRetrieval  # type: ignore[assignment]
 
@@ -40,7 +40,7 @@ class RetrieveRunOptions(FitRunOptions):
     def keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints
 
-    def estimate_of(self, seen: Observation, where: str) -> Estimated:
+    def estimate_of(self, seen: Observation, where: str) -> Estimate:
         seen = self.estimate.with_ids(seen, where)
         matches = self.estimate.retrieve(seen, where, workers=1)
         best = matches[0]

@@ -12,13 +12,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 from cadalign.arrays import worker_count
-from cadalign.batch.observation_fit import ObservationFit, opened_shape
+from cadalign.batch.observation_fit import ObservationFit, open_shape
 from cadalign.batch.outputs import (
     COLUMNS,
     RECORD_COLUMNS,
     draw_fit,
     json_of,
-    naming_row,
+    name_cells,
     result_row,
     write_csv,
 )
@@ -39,32 +39,32 @@ from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
 LARGEST_CHUNK = 512
-"""Most observations that a worker gets at a time, as of every long run."""
-_LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
-_FEW = 200  # observations, which are aligned sooner than processes start
+"""Maximum number of observations in a chunk, the work of one worker at a time."""
+_LEAST_CHUNKS = 64  # per run, so that all workers are busy until its end
+_FEW = 200  # observations: they are aligned before processes have started
 
-Estimated = tuple[Observation, Result, Row]
-"""What is aligned, its result, and further cells of the tables."""
+Estimate = tuple[Observation, Result, Row]
+"""The aligned observation, its result, and further cells of the table."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitRunOptions(ExperimentOptions):
-    """A run that aligns many observations, as ``estimate`` says."""
+    """Options of a run that aligns many observations."""
 
     experiment: ClassVar[str] = "fit"
     command: ClassVar[str] = "fit"
     columns: ClassVar[Columns] = ()
-    """Columns of the table beside those of every run."""
+    """Further columns of the table."""
     threads: ClassVar[int] = 1
-    """Number of threads of a run without workers, -1 for one for each core."""
+    """Number of threads of a run without workers; -1 for one per core."""
 
     inputs: tuple[Path, ...] = ()
-    """Observation files, folders of such, JSON lines, files of detectors."""
+    """Observation files, folders of observation files, JSON lines, or detectors' files."""
     changes: ObservationChanges = field(default_factory=ObservationChanges)
-    """Takes the place of the observations' own."""
+    """Camera that replaces the cameras of the observations."""
     detector: DetectorOptions = field(default_factory=DetectorOptions)
     pictures: int = 0
-    """Number of observations whose photos the page shows, the first ones."""
+    """Number of observations with pictures on the page, from the first."""
     estimate: ObservationFit = field(default_factory=ObservationFit)
 
     def __post_init__(self) -> None:
@@ -73,39 +73,39 @@ class FitRunOptions(ExperimentOptions):
 
     @property
     def files(self) -> tuple[Path | None, ...]:
-        """The files that the estimates depend on, beside the observations."""
+        """The files that the estimates depend on, besides the observations."""
         return self.changes.camera, self.detector.model, self.estimate.shape
 
     def keypoints(self) -> ModelKeypoints | None:
-        """Those that a detector's are paired with, where no model's are given.
+        """Return the keypoints of the learned shape, for a detector's file without a model.
 
-        Raises CadalignError if an option of the estimate is invalid, or its file cannot be read.
+        Raises CadalignError if an option of the estimate is invalid, or the shape cannot be read.
         """
         self.estimate.check()
         if self.estimate.shape is None:
             return None
-        shape = opened_shape(self.estimate.shape)
+        shape = open_shape(self.estimate.shape)
         named = isinstance(shape.ids[0], str)
         pairs = zip(shape.ids, shape.components[0].mean.tolist(), strict=False)
         return ModelKeypoints(
             tuple(ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
         )
 
-    def estimate_of(self, seen: Observation, where: str) -> Estimated:
-        """Estimate the object of an observation; raises CadalignError if it cannot be."""
+    def estimate_of(self, seen: Observation, where: str) -> Estimate:
+        """Align an observation; raises CadalignError if that fails."""
         seen = self.estimate.changed(seen)
         return seen, self.estimate.fit(seen, where), {}
 
 
 @dataclass(frozen=True)
 class ManyEstimates:
-    """Estimates of observations; see `cadalign.evaluation.runs.work.Experiment`."""
+    """The experiment of a run; see `cadalign.evaluation.runs.work.Experiment`."""
 
     options: FitRunOptions
     model: ModelKeypoints | None = None
-    """The keypoints that a detector's are paired with."""
+    """Model whose keypoints a detector's keypoints are matched to."""
     folder: RunFolder | None = field(default=None, repr=False)
-    """The folder that pictures go to; none are drawn without."""
+    """Folder for pictures; without it, none are drawn."""
     record_columns: Columns = RECORD_COLUMNS
 
     @property
@@ -118,8 +118,8 @@ class ManyEstimates:
         return [self._evaluate(task) for task in tasks]
 
     def failure(self, task: ObservationTask, reason: str) -> list[Row]:
-        """The row of an observation whose worker died, or that raised what nobody foresaw."""
-        named = naming_row(task.row, task.name, None)
+        """The row of an observation whose worker died or raised an unexpected error."""
+        named = name_cells(task.row, task.name, None)
         return [named | failed_row(reason) | {"observation": "", "result": ""}]
 
     def _evaluate(self, task: ObservationTask) -> Row:
@@ -131,16 +131,16 @@ class ManyEstimates:
         except CadalignError as error:
             text = "" if seen is None else json_of(seen.to_dict()).decode()
             row = failed_row(str(error)) | {"observation": text, "result": ""}
-        row |= naming_row(task.row, task.name, seen)
+        row |= name_cells(task.row, task.name, seen)
         if seen is not None:
             undrawn: tuple[str, ...] = ()
             if self.folder is not None and task.row < self.options.pictures:
                 undrawn = draw_fit(self.folder, row, seen, result)
             if result is not None:
-                told = [*(("picture", text) for text in undrawn), *_doubts(seen)]
-                row["warning_count"] += len(told)
+                warnings = [*(("picture", text) for text in undrawn), *_doubts(seen)]
+                row["warning_count"] += len(warnings)
                 for column, name in enumerate(("warning_kinds", "warnings")):
-                    texts = row[name], *(each[column] for each in told)
+                    texts = row[name], *(each[column] for each in warnings)
                     row[name] = "; ".join(filter(None, texts))
         return row
 
@@ -169,9 +169,9 @@ _photo_in = lru_cache(maxsize=1024)(photo_in)
 
 
 def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
-    """Kinds and texts of warnings about an observation's views: keypoints left out, the photo.
+    """Yield kinds and texts of warnings about views: keypoints left out, photos of another size.
 
-    A photo that cannot be read is told of where it is drawn.
+    Unreadable photos are reported when they are drawn.
     """
     for view in seen.views:
         if view.text_of_not_found:
@@ -190,12 +190,12 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
 
 
 def plan_run(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:
-    """Plan the estimates of the observations of all inputs.
+    """Plan a run over the observations of all inputs.
 
-    Raises CadalignError if an option is invalid, an input or the camera cannot be read, or what a
-    detector's file needs is missing.
+    Raises CadalignError if an option is invalid, an input or the camera cannot be read, or a
+    detector's file lacks its model or photos.
     """
-    options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
+    options.changes.read_camera((1, 1))  # of any size: reports an error once, not per row
     model, photos = options.keypoints(), options.detector.images
     tasks = ObservationTasks(options.inputs)
     if photos is not None and not photos.is_dir():
@@ -205,7 +205,7 @@ def plan_run(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]
         model = ModelKeypoints.load(options.detector.model)
     if model is None and tasks.has_detections:
         fix = "give the model's NAME.keypoints.json, or a learned shape"
-        raise InputError("the keypoints of the model are not known", where="model", fix=fix)
+        raise InputError("a detector's file needs a model", where="model", fix=fix)
     read = (read_bytes(path) for path in options.files if path is not None and path.is_file())
     config = options.as_config() | {"contents": fingerprint(tasks.fingerprint, *read)}
     drawn_in = folder.made_for_pictures() if options.pictures else None
@@ -222,22 +222,23 @@ def run_many(
     dask: str | None = None,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
-    """Align many observations, or retrieve their models, as a run that goes on where it was killed.
+    """Align many observations, or retrieve their models, as a run that can be continued.
 
     Parameters
     ----------
     options : FitRunOptions or RetrieveRunOptions
-        The inputs, and options of each estimate.
+        The inputs, and the options of each estimate.
     out : path-like
-        The run's folder: ``results.parquet`` and ``results.csv``, and what `cadalign.Results.open`
-        needs. Started again with the same options, a run that was killed goes on, and a finished
-        one stays as it is.
+        Folder of the run. It gets ``results.parquet`` and ``results.csv``, and can be opened by
+        `cadalign.Results.open`. With the same options, a killed run is continued, and a finished
+        run is left unchanged.
     workers : int, optional
-        Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
+        Number of processes: -1 for one per core, 0 to use none. By default -1, or 0 for fewer than
+        200 observations.
     dask : str, optional
-        Address of a Dask scheduler, whose workers are used instead.
+        Address of a Dask scheduler. Its workers are used instead of local processes.
     on_progress : callable
-        Is told of every chunk that is done.
+        Function called after every chunk.
 
     Raises
     ------
@@ -278,33 +279,33 @@ def fit_many(
     Parameters
     ----------
     observations : path, or iterable of path or of Observation
-        Observation files, folders of such, JSON lines, and detectors' files; or observations of a
-        program, which are written as JSON lines.
+        Observation files, folders of observation files, JSON lines, or detectors' files; or
+        `Observation` objects, which are written as JSON lines.
     out : path-like, optional
-        The run's folder, see `run_many`; observations of a program are kept beside it, as
-        ``<out>.jsonl``. Without it nothing is kept.
+        Folder of the run, see `run_many`. `Observation` objects are written beside it, as
+        ``<out>.jsonl``. Without a folder, no file is kept.
     workers, dask
         See `run_many`.
     pictures : int
-        Number of observations whose photos the page shows, the first ones.
+        Number of observations with pictures on the page, from the first.
     changes : ObservationChanges, optional
-        Takes the place of the observations' own, such as a camera for all.
+        Camera that replaces the cameras of the observations.
     detector : DetectorOptions, optional
         Model and photos of a detector's file.
     **options
         Fields of `cadalign.batch.ObservationFit`, such as ``method``, ``similar``, ``robust``,
-        ``loss``, ``shape``. Those that are not given are the observations' own; ``sigma="none"``
-        estimates it.
+        ``loss``, ``shape``. By default the observations' own settings. ``sigma="none"`` estimates
+        the standard deviation.
 
     Returns
     -------
     Results
-        In the order of the observations; the error takes the place of a result that there is not.
+        One entry per observation, in their order: the result, or the error of a failed alignment.
 
     Raises
     ------
     InputError
-        If an option is invalid or not known, or there are no observations.
+        If an option is invalid or unknown, or there are no observations.
     DataError
         If an input cannot be read, or the folder holds another run or cannot be written to.
 
@@ -339,12 +340,12 @@ def fit_many(
         run_many(chosen, folder, workers=workers, dask=dask)
         results = Results.open(folder)
         if out is None:
-            list(results)  # reads each, before the folder goes away
+            list(results)  # reads all results before the folder is deleted
         return results
 
 
 def _inputs(observations: Any, beside: Path) -> tuple[Path, ...]:
-    """Paths of inputs; observations are written as JSON lines, to the file ``beside`` the run."""
+    """Return the paths of inputs; writes observations as JSON lines to the file ``beside``."""
     if isinstance(observations, str | os.PathLike):
         observations = [observations]
     try:

@@ -1,7 +1,7 @@
-"""Inputs of a run over many observations, as tasks of which memory holds few at a time.
+"""Inputs of a run over many observations, as tasks that are read when they are needed.
 
-An input is an observation file, a folder of such files, JSON lines (an observation in every line,
-``.jsonl`` or ``.ndjson``), or a detector's file of keypoints
+An input is an observation file, a folder of observation files, JSON lines (one observation per
+line, ``.jsonl`` or ``.ndjson``), or a detector's keypoint file
 (`cadalign.datasets.read_image_keypoints`).
 """
 
@@ -23,33 +23,33 @@ from cadalign.io.documents import read_json
 from cadalign.io.files import listed, open_input, read_bytes, read_text
 from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
 
-_CELLS = 3  # of a task: the number of its source, its own in it, and the byte where it begins
+_CELLS = 3  # per task: index of its source, its index or line there, offset of its line
 
 
 class ObservationTask(NamedTuple):
     """One observation of a run."""
 
     row: int
-    """Its number in the run."""
+    """Index in the run."""
     name: str
-    """Its file, with the line or the object where the file holds several."""
+    """File; with the line or object if the file holds several."""
     content: str | bytes | ImageKeypoints | DataError
-    """Its JSON, bytes of a line, or a detector's keypoints; or why these cannot be read."""
+    """JSON text, the bytes of a line, a detector's keypoints, or the error of reading them."""
     folder: str
-    """The folder that paths in it are relative to, the same for a worker elsewhere."""
+    """Absolute folder, to which paths in the content are relative."""
 
 
 class ObservationTasks(Sequence[ObservationTask]):
-    """The observations of all inputs; of a file of lines it keeps where each begins.
+    """The observations of all inputs; of JSON lines, only the offsets are held in memory.
 
     Raises DataError if a file cannot be read, or an input holds no observation.
     """
 
     def __init__(self, inputs: Iterable[Path]) -> None:
         self._digest = hashlib.sha256()
-        self._sources: list[tuple[Path, str]] = []  # with the folder that each lies in
+        self._sources: list[tuple[Path, str]] = []  # file and its folder
         self._cells = array("q")
-        self._objects: dict[int, list[tuple[str, Any]]] = {}  # of a detector's file
+        self._objects: dict[int, list[tuple[str, Any]]] = {}  # of detectors' files
         self.has_detections = False
         for path in inputs:
             for file, kind in _files_of(path):
@@ -95,10 +95,10 @@ class ObservationTasks(Sequence[ObservationTask]):
         if path.suffix.lower() in LINES:
             self._add_lines(path)
             return
-        with suppress(DataError):  # which the task's row says
+        with suppress(DataError):  # reported in the row of the task
             self._digest.update(read_bytes(path))
         if kind == DETECTOR:
-            # Which memory holds whole; objects that cannot be read come last.
+            # Held in memory; unreadable objects come last.
             bad: dict[str, DataError] = {}
             good = read_image_keypoints(path, problems=bad)
             objects = [*((each.source, each) for each in good), *bad.items()]
@@ -111,12 +111,12 @@ class ObservationTasks(Sequence[ObservationTask]):
             self._cells.extend((len(self._sources), 0, 0))
 
     def _add_lines(self, path: Path) -> None:
-        """Find where the lines of a file begin; empty ones are passed over."""
+        """Find the offsets of a file's lines; skips empty lines."""
         place, before = 0, len(self._cells)
         with open_input(path) as file:
             for own, line in enumerate(file, start=1):
                 mark = len(BOM_UTF8) if own == 1 and line.startswith(BOM_UTF8) else 0
-                if line[mark:].strip():  # behind the mark that programs of Windows write
+                if line[mark:].strip():  # after a byte order mark
                     self._cells.extend((len(self._sources), own, place + mark))
                 place += len(line)
                 self._digest.update(line)
@@ -125,8 +125,8 @@ class ObservationTasks(Sequence[ObservationTask]):
 
 
 def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:
-    """The files of an input with their kinds; of a folder's JSON files those of observations."""
-    if not os.path.isdir(path):  # also of a name that no file can have
+    """Yield the files of an input with their kinds; of a folder, only observation files."""
+    if not os.path.isdir(path):  # also for an invalid file name
         kind = _kind_of(path)
         if kind not in (DETECTOR, OBSERVATION):
             refuse_other_file(path, OBSERVATION)
@@ -150,5 +150,5 @@ def _kind_of(path: Path) -> str | None:
         return DETECTOR if suffix == TABLE else OBSERVATION
     try:
         return kind_of(read_json(path))
-    except DataError:  # which its row says
+    except DataError:  # reported in its row
         return OBSERVATION

@@ -1,4 +1,4 @@
-"""Specification of runs over many observations: all that their page shows."""
+"""Specification of runs over many observations, for their pages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from cadalign.batch.outputs import COLUMNS as TABLE_COLUMNS
-from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, warnings_text
+from cadalign.batch.outputs import NAME_COLUMNS, RECORD_COLUMNS, page_names, warnings_text
 from cadalign.batch.runs import FitRunOptions, plan_run
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
@@ -30,7 +30,7 @@ from cadalign.geometry.alignment import extent
 from cadalign.io.observation import Observation
 
 METHOD = "alignment"
-"""Name of the estimate on the page, the same in all runs, such that they can be compared."""
+"""Name of the method on the page; equal in all runs, so that they can be compared."""
 ROTATION_STD = Metric("rotation_std_deg", "rotation uncertainty", "deg", head="R std. dev.")
 WARNINGS = Metric("warning_count", "warnings", digits=1, log=False)
 INLIERS = Metric("inliers", "keypoints kept", digits=1, better="high", log=False)
@@ -47,16 +47,16 @@ _PLACES = np.array([0.1, 0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 50])
 
 @dataclass(frozen=True, eq=False)
 class FitRun(Run):
-    """A run over many observations, in the terms of a page on instances."""
+    """A run over many observations, with its rows as instances of a page."""
 
     @classmethod
     def open(cls, path: Path, name: str | None = None, *, columns: Columns = TABLE_COLUMNS) -> Self:
         """See `Run.open`."""
         run = super().open(path, name, columns=columns)
-        return replace(run, results=_as_instances(run.results))
+        return replace(run, results=_add_names(run.results))
 
     def records(self, columns: Columns) -> Iterator[Row]:
-        """The records of the observations that could be read, made of their stored results."""
+        """Build the instance records of all observations that could be read."""
         names = self.results.select(["row", "category", "model_id", "view", "reason"]).to_pylist()
         of_row = {each.pop("row"): each for each in names}
         for stored in super().records(RECORD_COLUMNS):
@@ -64,9 +64,9 @@ class FitRun(Run):
                 yield _record(stored, of_row[stored["row"]] | {"method": METHOD})
 
 
-def _as_instances(table: pa.Table) -> pa.Table:
-    """The table of results with the names of instances, the estimates of all by one name."""
-    naming = [name for name in NAMING if name in table.column_names]
+def _add_names(table: pa.Table) -> pa.Table:
+    """Add the names of instances to the table of results, and set the method's name."""
+    naming = [name for name in NAME_COLUMNS if name in table.column_names]
     names = [page_names(row) for row in table.select(naming).to_pylist()]
     for name in ("category", "model_id", "view"):
         table = table.append_column(name, pa.array([each[name] for each in names]))
@@ -75,7 +75,7 @@ def _as_instances(table: pa.Table) -> pa.Table:
 
 
 def _record(stored: Row, names: Row) -> Row:
-    """The instance record of a stored result, or of the observation that has none."""
+    """Build the instance record of a stored result, or of a failed observation."""
     reason, result = names.pop("reason"), None
     if stored["result"]:
         result = Result.from_dict(json.loads(stored["result"]))
@@ -121,8 +121,8 @@ def _describe(run: Run) -> str:
     inputs = [Path(each).name for each in run.config.get("inputs", ())]
     more = f" and {len(inputs) - 3} more" if len(inputs) > 3 else ""
     listed = f" of {', '.join(inputs[:3])}{more}" if inputs else ""
-    said = warnings_text(run.results)
-    return f"on {run.total:,} observations{listed}" + (f"; {said}" if said else "")
+    text = warnings_text(run.results)
+    return f"on {run.total:,} observations{listed}" + (f"; {text}" if text else "")
 
 
 SPEC = Spec(
@@ -139,8 +139,8 @@ SPEC = Spec(
     metrics=_GALLERY,
     about="Red is the estimate: its box, and the model warped to the estimated shape.",
     note=(
-        "Medians over the observations that did not fail; of keypoints and warnings the mean. "
-        "Uncertainties are the stated standard deviations. No truth is known here: a small "
-        "residual alone does not tell that an alignment is right."
+        "Medians over the observations that did not fail; means for keypoints and warnings. "
+        "Uncertainties are estimated standard deviations. There is no ground truth here: a small "
+        "residual alone does not prove that an alignment is correct."
     ),
 )

@@ -21,37 +21,37 @@ from cadalign.errors import CadalignError
 from cadalign.io.files import keeping
 
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
-COMMANDS = {  # the class of each in its module, and the first sentence of its description
+COMMANDS = {  # module and class, and the first sentence of the help
     "demo": (
         "evaluate.Demo",
-        "Align stretched models to pictures of the originals and show the result.",
+        "Align stretched models to pictures of the originals, and show the result.",
     ),
-    "fit": ("fit.Fit", "Align a model to what an observation file holds, and draw the result."),
-    "observe": ("observe.Observe", "Pair the keypoints of a detector in a photo with a model's."),
+    "fit": ("fit.Fit", "Align a model to an observation, and draw the result."),
+    "observe": ("observe.Observe", "Match a detector's keypoints to a model's keypoints."),
     "annotate": (
         "annotate.Annotate",
-        "Mark keypoints on photos and a model in the browser, and see the alignment as you go.",
+        "Mark keypoints on photos and a model in the browser, with a live alignment.",
     ),
     "retrieve": (
         "retrieve.Retrieve",
-        "Find the models of a library that explain an image's keypoints best.",
+        "Find the models of a library that best explain an image's keypoints.",
     ),
     "library": ("retrieve.LibraryCommand", "Build and inspect libraries of CAD models."),
-    "shape": ("shape.ShapeCommand", "Learn and inspect the shapes of categories."),
+    "shape": ("shape.ShapeCommand", "Learn and inspect shape models of categories."),
     "evaluate": ("evaluate.Evaluate", "Evaluate methods on a dataset."),
     "simulate": (
         "evaluate.Simulate",
         "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
     ),
-    "report": ("evaluate.ReportCommand", "Show the result of one or more runs."),
+    "report": ("evaluate.ReportCommand", "Write a page with the results of one or more runs."),
     "export": ("fit.Export", "Write a fit for another tool."),
     "render": (
         "render.Render",
-        "Draw a model: a still, or a contact sheet of several views.",
+        "Draw a model: one view, or a contact sheet of several views.",
     ),
     "doctor": (
         "doctor.Doctor",
-        "Check the renderers, and show how to enable missing ones.",
+        "Check the renderers, and show how to enable those that fail.",
     ),
 }
 
@@ -62,18 +62,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 on success, 1 if the input was refused; a wrong command line exits with 2. Runs (evaluate,
-        simulate) exit with 3 if they finished with some failed rows.
+        0 on success, 1 if the input was refused, 2 for a wrong command line, 3 if some rows of a
+        run failed.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
         sys.stdout.write(f"cadalign {__version__}\n")
         return 0
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    # A start makes a million objects that stay: the search for garbage among them takes 6 % of it.
+    # Imports create a million permanent objects. Rarer collections save 6 % of a start.
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
     try:
-        with keeping(()):  # nor write over the models and textures that it reads
+        with keeping(()):  # protects the models and textures that are read from being overwritten
             return int(_parse(given).run())
     except UsageError as error:
         sys.stderr.write(f"cadalign: {error}\n")
@@ -82,20 +82,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"cadalign: {error}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write("cadalign: interrupted; a run goes on if it is started again\n")
+        sys.stderr.write("cadalign: interrupted; start a run again to continue it\n")
         return 1
     except BrokenPipeError:  # the reader of the output has closed it
         return 0
 
 
 def class_of(name: str) -> Any:
-    """The class of a command; its module is imported when the command is called."""
+    """Import the class of a command."""
     module, _, kind = COMMANDS[name][0].partition(".")
     return getattr(import_module(f"cadalign.cli.{module}"), kind)
 
 
 def _parse(arguments: list[str]) -> Any:
-    """The called command with its options; any other line is answered by help or an error."""
+    """Parse the command line; help and errors exit."""
     config = (tyro.conf.OmitSubcommandPrefixes,)
     name, *rest = arguments or [""]
     if name in COMMANDS:
@@ -104,20 +104,20 @@ def _parse(arguments: list[str]) -> Any:
         prog = f"cadalign {name}"
         return tyro.cli(command, prog=prog, description=about, args=rest, config=config)
     stubs = [
-        Annotated[_Listed, tyro.conf.subcommand(name, description=summary)]
+        Annotated[_CommandStub, tyro.conf.subcommand(name, description=summary)]
         for name, (_, summary) in COMMANDS.items()
     ]
     listed: Any = reduce(or_, stubs)
     return tyro.cli(
         listed,
         prog="cadalign",
-        description="Align CAD models to photos from keypoints. --version prints the version. "
-        "`cadalign <command> --help` describes a command.",
+        description="Align CAD models to photos from keypoints. "
+        "`cadalign <command> --help` describes a command. `cadalign --version` prints the version.",
         args=arguments,
         config=config,
     )
 
 
 @dataclass(frozen=True)
-class _Listed:
-    """A command in the list of all, none of which is called."""
+class _CommandStub:
+    """A command in the list that `cadalign --help` prints."""

@@ -1,4 +1,4 @@
-"""`cadalign annotate`: align a model to photos by clicking, in the browser."""
+"""`cadalign annotate`: align a model to photos by clicking in the browser."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.annotate.files import SessionOptions, only_annotator
-from cadalign.cli.common import UsageError, answer, say, waiting
+from cadalign.annotate.files import SessionOptions, lock_folder
+from cadalign.cli.common import UsageError, answer, say, show_status
 from cadalign.io.files import made_folder, writing
 from cadalign.io.kinds import MESH, PHOTO, kind_of_file
 
@@ -22,19 +22,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Annotate(SessionOptions):
-    """Mark keypoints on photos and a model in the browser, and see the alignment as you go.
+    """Mark keypoints on photos and a model in the browser, with a live alignment.
 
-    Serves a page on this machine only. Every change is saved at once: an observation beside each
-    photo (photo.json), which `cadalign fit` aligns, and the model's keypoints
-    (model.keypoints.json).
+    Serves a page that only this machine can open. Saves every change at once: an observation beside
+    each photo (photo.json), for `cadalign fit`, and the model's keypoints (model.keypoints.json).
     """
 
     image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTO")]
     """A photo, or a folder of photos."""
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """The model, an OBJ, PLY, GLB, glTF, STL or OFF file."""
+    """The model: an OBJ, PLY, GLB, glTF, STL or OFF file."""
     port: int = 0
-    """Port to listen on; 0 for a free one."""
+    """Port of the page; 0 selects a free port."""
     no_open: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the address instead of opening a browser."""
 
@@ -46,7 +45,7 @@ class Annotate(SessionOptions):
         from cadalign.annotate.session import find_session_files, open_session
 
         if [kind_of_file(path) for path in (self.image, self.model)] == [MESH, PHOTO]:
-            what = f"{self.image} is a mesh and {self.model} a photo: they are exchanged"
+            what = f"{self.image} is a mesh and {self.model} is a photo: swap them"
             raise UsageError(what, where="PHOTO MODEL", fix="cadalign annotate PHOTO MODEL")
         listener = listen(self.port)
         with ExitStack() as opened:
@@ -58,27 +57,27 @@ class Annotate(SessionOptions):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)
             access = Access(listener.getsockname()[1])
             files = find_session_files(self)
-            opened.enter_context(only_annotator(files[0][1].parent))
-            with waiting("reading photos and model"):
+            opened.enter_context(lock_folder(files[0][1].parent))
+            with show_status("reading photos and model"):
                 session = open_session(self, files)
             warming = threading.Thread(target=session.warm_up, daemon=True)
             warming.start()
-            # An extension in C++ that works on while the interpreter ends aborts the process.
+            # A C++ extension that still runs when the interpreter ends aborts the process.
             opened.callback(warming.join)
             opened.callback(session.ended.set)
             with suppress(KeyboardInterrupt):
-                # Ends as Ctrl+C does, with everything saved and unlocked.
+                # SIGTERM ends the command as Ctrl+C does: marks are saved, files unlocked.
                 signal.signal(signal.SIGTERM, signal.default_int_handler)
                 answer(access.url)
-                say("Open this address in a browser of this machine; end with Ctrl+C.")
+                say("Open this address in a browser on this machine. End with Ctrl+C.")
                 if not self.no_open:
                     webbrowser.open(access.url)
                 make_server(make_app(session, access)).run(sockets=[listener])
-            return _save_and_say_where(session)
+            return _save(session)
 
 
-def _save_and_say_where(session: Session) -> int:
-    """Save what could not be saved before; returns the exit code."""
+def _save(session: Session) -> int:
+    """Save all annotations that could not be saved before; returns the exit code."""
     session.save_unsaved()
     for trouble in sorted({each.save_error for each in session.unsaved}):
         say(f"Not saved: {trouble}")

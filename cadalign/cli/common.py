@@ -1,4 +1,4 @@
-"""Common parts of commands: what they say and return, output folders, groups of commands."""
+"""Common parts of commands: output, exit codes, output folders, groups of commands."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ if TYPE_CHECKING:
 
 SUCCESS: Final = 0
 NOTHING_WORKED: Final = 1
-"""Also what a refused input gives."""
+"""Also the exit code of a refused input."""
 SOME_FAILED: Final = 3
-"""All is done and written, but some rows say ``failed``."""
+"""The run is complete, but some rows have the status ``failed``."""
 _PIPE_WIDTH = 120
 
 
 class UsageError(CadalignError):
-    """The command line lacks an argument, or has one too many; it exits with 2."""
+    """A missing or superfluous argument on the command line; exits with 2."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JsonOption:
-    """The option of the commands that print a table or JSON."""
+    """Option of commands that print a table or JSON."""
 
     json: bool = False
     """Print the result as JSON."""
 
 
 def group_of(about: str, commands: dict[str, Any] | Callable[[], dict[str, Any]]) -> Any:
-    """The command that is one of some others, chosen by name; ``about`` is its help.
+    """Make a command of several subcommands; ``about`` is its help.
 
-    A function makes the others when the command is called.
+    A function for ``commands`` is called when the command is.
     """
 
     def choice() -> Any:
@@ -64,7 +64,7 @@ def group_of(about: str, commands: dict[str, Any] | Callable[[], dict[str, Any]]
 
 
 def exit_code(failed: int, total: int) -> int:
-    """The exit code where so many of all have failed."""
+    """Return the exit code of a run of which ``failed`` of ``total`` rows failed."""
     if failed == total:
         return NOTHING_WORKED
     return SOME_FAILED if failed else SUCCESS
@@ -78,19 +78,19 @@ def say(text: str) -> None:
 def answer(text: str) -> None:
     """Write a result to standard output."""
     sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()  # who reads a pipe need not wait for the end
+    sys.stdout.flush()  # the reader of a pipe gets it at once
 
 
 def print_json(value: Any) -> None:
-    """Print a value as JSON on standard output; what is not finite becomes null."""
+    """Print a value as JSON on standard output; non-finite numbers become null."""
     answer(json.dumps(finite(value), indent=2))
 
 
 @contextmanager
-def waiting(text: str) -> Iterator[Callable[[str], object]]:
-    """Show on a terminal what is waited for, and that it goes on; elsewhere show nothing.
+def show_status(text: str) -> Iterator[Callable[[str], object]]:
+    """Show a text with a spinner on a terminal; elsewhere show nothing.
 
-    Gives a function that changes the text.
+    Yields a function that changes the text.
     """
     if not sys.stderr.isatty():
         yield str
@@ -100,11 +100,11 @@ def waiting(text: str) -> Iterator[Callable[[str], object]]:
 
 
 def new_console(*, stderr: bool = True) -> Console:
-    """Make a console: messages go to standard error, results to standard output.
+    """Make a console on standard error, for messages, or standard output, for results.
 
-    Output to a file or a pipe has lines of a fixed width that is enough for tables.
+    Lines to a file or a pipe have a fixed width that is enough for tables.
     """
-    from rich.console import Console  # only here: a fit is over before it is imported
+    from rich.console import Console  # not at the top: the import takes longer than a fit
 
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _PIPE_WIDTH
@@ -136,13 +136,13 @@ def print_table(table: ConsoleTable) -> None:
 
 
 def make_folder_of(file: Path) -> None:
-    """Create the folder of an output file; raises DataError on failure, or if it is a folder."""
+    """Create the folder of an output file; raises DataError on failure, or for a folder."""
     refuse_folder(file)
     made_folder(file.absolute().parent)
 
 
-def beside(given: Path, ending: str) -> Path:
-    """An output folder beside an input, by its name; `.` and `..` have none of their own."""
+def path_beside(given: Path, ending: str) -> Path:
+    """Return the path beside an input that has its name and an ending; resolves `.` and `..`."""
     if given.is_dir():
         given = given.resolve()
         return given.with_name(given.name + ending)

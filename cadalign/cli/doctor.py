@@ -1,4 +1,4 @@
-"""`cadalign doctor`: check this machine, and compile ahead for it."""
+"""`cadalign doctor`: check the renderers, and compile the solvers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.cli.common import answer, waiting
+from cadalign.cli.common import answer, show_status
 from cadalign.errors import InputError
 from cadalign.estimation.options import METHODS, RansacOptions
 from cadalign.geometry.alignment import Alignment, Box
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check the renderers, and show how to enable missing ones.
+    """Check the renderers, and show how to enable those that fail.
 
-    Also shows the cache of compiled solvers. With --compile, compiles the solvers ahead.
+    Also shows the cache of compiled solvers.
     """
 
     compile: bool = False
-    """Compile all solvers now, as for a Docker image, in place of when they are first called."""
+    """Compile all solvers now, for example in a Docker image, instead of at their first call."""
 
     def run(self) -> int:
         """Run the checks; returns the exit code, 0 if ray casting works."""
@@ -39,15 +39,15 @@ class Doctor:
     def _check(self) -> int:
         from cadalign.render.probe import REMEDIES, best_renderer
 
-        with waiting("trying the renderers, each in a process of its own ..."):
-            renderers = probed_renderers()
+        with show_status("testing the renderers ..."):
+            renderers = probe_renderers()
         for each in renderers:
             answer(f"{each.name:9} {'works' if each.works else 'fails'}: {each.detail}")
-        answer(f"--renderer auto takes: {best_renderer()}")
+        answer(f"Default renderer: {best_renderer()}")
         for each in renderers:
             if not each.works:
                 answer(f"To enable {each.name}: {REMEDIES[each.name]}")
-        answer(f"Compiled solvers: {compiled_cache()}")
+        answer(f"Compiled solvers: {describe_cache()}")
         return 0 if renderers[-1].works else 1
 
     def _compile(self) -> int:
@@ -55,30 +55,30 @@ class Doctor:
 
         folder = kernel_folder()
         if not can_write(folder):
-            fix = "set NUMBA_CACHE_DIR to a folder that can be"
+            fix = "set NUMBA_CACHE_DIR to a writable folder"
             raise InputError(f"{folder} cannot be written to", where="--compile", fix=fix)
         began = time.perf_counter()
-        with waiting("compiling ..."):
+        with show_status("compiling ..."):
             compile_ahead()
-        answer(f"Compiled in {time.perf_counter() - began:.1f} s: {compiled_cache()}")
+        answer(f"Compiled in {time.perf_counter() - began:.1f} s: {describe_cache()}")
         return 0
 
 
-def probed_renderers() -> list[Probe]:
-    """Try every renderer in a process of its own, ray casting last; takes some seconds."""
+def probe_renderers() -> list[Probe]:
+    """Test each renderer in its own process, ray casting last; takes some seconds."""
     from cadalign.render.probe import RENDERERS, probe_renderer
 
     return [probe_renderer(name) for name in RENDERERS]
 
 
 def can_write(folder: Path) -> bool:
-    """True if a folder, or the nearest above it that exists, can be written to."""
+    """True if a folder, or its nearest existing parent, is writable."""
     existing = next((place for place in (folder, *folder.parents) if place.is_dir()), Path("/"))
     return os.access(existing, os.W_OK)
 
 
-def compiled_cache() -> str:
-    """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
+def describe_cache() -> str:
+    """Describe the cache of compiled solvers: its folder and number of functions."""
     from cadalign.compile.folder import kernel_folder
 
     folder = kernel_folder()
@@ -87,7 +87,7 @@ def compiled_cache() -> str:
         return f"{count} functions kept in {folder}"
     if can_write(folder):
         return f"none yet; they will be kept in {folder}"
-    fix = "set NUMBA_CACHE_DIR, or every process compiles anew"
+    fix = "set NUMBA_CACHE_DIR, or every process compiles the solvers again"
     return f"{folder} cannot be written to; {fix}"
 
 
@@ -99,7 +99,7 @@ _RANSAC = RansacOptions(max_iterations=10)
 
 
 def compile_ahead() -> None:
-    """Compile what fits, alignments, retrieval and evaluations call, unless it is on disk."""
+    """Compile all solvers that are not in the cache yet."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context) as pool:
         jobs = [  # the longest first
@@ -138,8 +138,7 @@ def _align_shape(views: int) -> None:
     shape = ShapeModel.from_basis(points, directions, [0.1, 0.1])
     seen = [View(_CAMERA, pixels, sigma=1.0)] * views
     if views > 1:
-        # Two keypoints suggest no poses: the search for these is compiled by the other process
-        # meanwhile, which begins with it.
+        # Two keypoints propose no poses. The other process compiles the search for poses first.
         few = View(_CAMERA, pixels[:2], ids=(0, 1), sigma=1.0)
         align(shape, [few] * views, init=[_POSE] * views)
     align(shape, seen)

@@ -1,4 +1,4 @@
-"""`cadalign evaluate`, `simulate` and `demo`: runs that go on where they were killed; `report`."""
+"""`cadalign evaluate`, `simulate` and `demo`: runs of experiments; `cadalign report`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.options import name_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.evaluation.experiments.keypointnet import DemoOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _COMMAND = "evaluate"
 _EXIT_CODES = (
-    "Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or "
-    "all rows failed, 2 a wrong command line."
+    "Exit codes: 0 all rows succeeded, 3 some rows failed, 1 all rows failed or the run was "
+    "refused or interrupted, 2 wrong command line."
 )
 
 
@@ -39,23 +39,23 @@ class RunCommand(JsonOption, RunOptions):
     options_type: ClassVar[type[ExperimentOptions]]
 
     def __post_init__(self) -> None:
-        """Check nothing: options check themselves once the command runs, and refuse in one line."""
+        """Skip the checks: `do_run` makes them, and reports an error in one line."""
 
     def run(self) -> int:
-        """Do the run and say what came out; returns the exit code."""
+        """Do the run and print its results; returns the exit code."""
         spec, run = self.do_run()
         code = conclude(spec, run, json=self.json)
         write_run_report(run.folder)
         return code
 
     def do_run(self) -> tuple[Spec, Run]:
-        """Do the run, showing its progress; gives its specification and its tables."""
+        """Do the run and show its progress; returns its specification and its tables."""
         from cadalign.evaluation.api import prepared
         from cadalign.evaluation.runs.engine import execute
 
         kind = self.options_type
-        # What modules of users print is not the command's output.
-        with redirect_stdout(sys.stderr), named_as_flags(self, sweep="SWEEP"):
+        # Modules of users may print, which must not mix with the command's output.
+        with redirect_stdout(sys.stderr), name_flags(self, sweep="SWEEP"):
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
             folder = RunFolder(self.out or Path("runs") / options.run_name)
             plan, pool = prepared(options, folder, workers=self.workers, dask=self.dask)
@@ -72,9 +72,9 @@ def command_of(
     *,
     about: str | None = None,
 ) -> Any:
-    """The command of an experiment: its options, those of every run, and those of its ``base``.
+    """Make the command of an experiment from its options and a ``base`` command.
 
-    ``about`` is its help, by default that of the options.
+    ``about`` is its help, by default the docstring of the options.
     """
     namespace = {"options_type": options, "__doc__": about or options.__doc__}
     return make_dataclass(
@@ -83,7 +83,7 @@ def command_of(
 
 
 def _evaluations() -> dict[str, Any]:
-    """The command of every experiment that `cadalign evaluate` runs."""
+    """Make the subcommands of `cadalign evaluate`, one per experiment."""
     return {
         options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
         for options in known_options()
@@ -97,13 +97,12 @@ Simulate: Any = command_of(SweepOptions)
 
 @dataclass(frozen=True, kw_only=True)
 class _DemoCommand(RunCommand):
-    """The end of a demonstration: a page called index.html, whatever failed."""
+    """The command `cadalign demo`; it writes index.html even if models failed."""
 
     out: Path = Path("demo")
-    """Folder to write to."""
+    """Folder for the results and index.html."""
     files: Path | None = None
-    """Write the files of the README's example to this folder, to try commands with, and nothing
-    else."""
+    """Only write the files of the README's example to this folder."""
 
     def run(self) -> int:
         """Run the demonstration; returns the exit code."""
@@ -125,17 +124,17 @@ Demo: Any = command_of(DemoOptions, _DemoCommand)
 
 @dataclass(frozen=True)
 class ReportCommand:
-    """Show the result of one or more runs.
+    """Write a page with the results of one or more runs.
 
-    The page holds the headline table, plots, and a gallery whose instances open with their numbers
-    and in 3D. It needs no network. Several runs of one kind stand beside each other. A
-    run may be unfinished: the page shows what there is.
+    The page holds the main table, plots, and a gallery of instances in 3D. It works without a
+    network. Several runs of one kind are compared side by side. An unfinished run is shown as far
+    as it got.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Folders of runs, as `cadalign demo`, `evaluate` and `simulate` write them."""
+    """Folders of runs that `cadalign demo`, `evaluate`, `simulate`, `fit` or `retrieve` wrote."""
     out: Path | None = None
-    """File to write; by default report.html, in the run's folder if it is one run."""
+    """Page to write; by default report.html, in the run's folder if there is a single run."""
 
     def run(self) -> int:
         """Write the report; returns the exit code."""
@@ -169,8 +168,8 @@ _TURN, _PLACE, _STRETCH = (-2.578, -0.193, 0.824), (0.0, 0.291, 2.735), (1.0, 1.
 def write_example(folder: Path) -> None:
     """Write the files of the README's example to a folder.
 
-    They are chair.obj, chair.keypoints.json, photo.jpg, which shows another chair with a focal
-    length of 935 px, and found.json, as a detector finds its keypoints.
+    The files are chair.obj, chair.keypoints.json, photo.jpg (another chair at a focal length of
+    935 px) and found.json (a detector's keypoints in that photo).
     """
     from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.geometry.alignment import Alignment

@@ -1,4 +1,4 @@
-"""`cadalign fit`: align the models of observation files; `export`: a fit for another tool."""
+"""`cadalign fit` and `cadalign export`: align models to observations, and write the result."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from cadalign.batch.observation_fit import ObservationFit
-from cadalign.cli.common import answer, beside, say, waiting
-from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
+from cadalign.cli.common import answer, path_beside, say, show_status
+from cadalign.cli.options import CameraOptions, ManyCommand, name_flags
 from cadalign.errors import DataError
 from cadalign.export.aligned_object import AlignedObject, export_object, format_of
 from cadalign.io.documents import in_file, read_json
@@ -28,22 +28,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(ManyCommand, ObservationFit, CameraOptions):
-    """Align a model to what an observation file holds, and draw the result.
+    """Align a model to an observation, and draw the result.
 
-    Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
-    known lengths. Prints the alignment and how well each piece of evidence agrees with it. Further
-    options, such as priors, stand in the file. Writes fit.json and overlay.png, overlay_1.png and
-    so on for further views. Many observations, as of several objects of one photo, are a run, which
-    goes on where it was killed: it writes results.parquet and results.csv with a row for each, and
-    report.html. Exit codes of a run: 0 all are aligned, 3 some failed, 1 all failed or refused, 2 a
+    An observation holds keypoints in one or several views, and optionally masks, depth, gravity,
+    the camera's height and known lengths. Further settings, such as priors, are fields of the
+    observation file. Prints the alignment and how well each piece of evidence agrees with it.
+    Writes fit.json and one picture per view: overlay.png, overlay_1.png and so on.
+
+    Several observations are aligned as a run. It writes results.parquet and results.csv, with a row
+    per observation, and report.html. A killed run continues when the same command is started again.
+
+    Exit codes of a run: 0 all aligned, 3 some failed, 1 all failed or the input was refused, 2
     wrong command line.
     """
 
     out: Path | None = None
-    """Folder to write to; by default <observation>_fit beside the file or folder."""
+    """Output folder; by default <observation>_fit beside the observation file or folder."""
     focal: Literal["known", "estimate"] | float | None = None  # type: ignore[assignment]
-    """Focal length [px], in the place of the file's, or: known (the file's) or estimate; by default
-    known, if every view has one. Views of equal cameras share an estimated one."""
+    """Focal length [px]; or known, to use the file's value; or estimate. By default known if every
+    view has a focal length, otherwise estimate. Views with equal cameras share one estimate."""
 
     @property
     def estimate(self) -> ObservationFit:
@@ -53,10 +56,10 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
         return ObservationFit(**given)
 
     def run(self) -> int:
-        """Run the fit, or the fits; returns the exit code."""
+        """Do the fit or the run; returns the exit code."""
         path, how = self.first, self.estimate
-        with named_as_flags(self):
-            data = self.only()
+        with name_flags(self):
+            data = self.read_single()
             if data is None:
                 from cadalign.batch.runs import FitRunOptions  # takes time to import
                 from cadalign.cli.runs import inputs_of, run_command
@@ -66,15 +69,15 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
             how.check()
             seen = how.read(data, str(path), folder=path.parent, changes=self.changes)
             seen = how.changed(seen)
-            with waiting("fitting"):
+            with show_status("fitting"):
                 result = how.fit(seen, str(path), note=say)
         self._write(path, seen, result)
         return 0
 
     def _write(self, path: Path, seen: Observation, result: Result) -> None:
-        """Draw the fit of an observation file, and write and print what was found."""
-        pictures = drawn(seen, result) if self.picture else []
-        out = self.out or beside(path, "_fit")
+        """Draw, write and print the result of a fit."""
+        pictures = draw_views(seen, result) if self.picture else []
+        out = self.out or path_beside(path, "_fit")
         made_folder(out)
         fitted = seen.to_dict(folder=out.absolute())
         text = json.dumps(result.to_dict() | {"observation": fitted}, indent=2) + "\n"
@@ -92,10 +95,10 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
             say(f"{'Picture' if len(paths) == 1 else 'Pictures'}: {listed}")
 
 
-def drawn(observation: Observation, result: Result) -> list[ByteImage]:
-    """Pictures of all views; DataError if a photo or the model cannot be read.
+def draw_views(observation: Observation, result: Result) -> list[ByteImage]:
+    """Draw the result on all views; raises DataError if a photo or the model cannot be read.
 
-    The mesh of a stretched model fitted to keypoints alone is drawn as a box.
+    A stretched model fitted to keypoints alone is drawn as a box.
     """
     from cadalign.io.images import read_mask
     from cadalign.render.overlay import draw_result, mesh_of, photo_of
@@ -121,26 +124,27 @@ def drawn(observation: Observation, result: Result) -> list[ByteImage]:
 class Export:
     """Write a fit for another tool.
 
-    GLB holds the textured model, stretched or warped, the cameras and the photos behind it: it
-    opens in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh.
+    GLB holds the aligned model with its texture, the cameras, and the photos behind the model.
+    Blender, three.js and other viewers show the same scene as the overlay. OBJ and PLY hold only
+    the mesh.
     """
 
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON")]
-    """Result of `cadalign fit`, or its folder."""
+    """The fit.json of `cadalign fit`, or its folder."""
     to: Path
-    """File to write, whose ending tells the format: .glb, .obj, .ply."""
+    """File to write. Its ending sets the format: .glb, .obj or .ply."""
 
     def run(self) -> int:
         """Write the file; returns the exit code."""
         fit = self.fit / "fit.json" if self.fit.is_dir() else self.fit
-        with named_as_flags(self):
+        with name_flags(self):
             about = format_of(self.to).about
             path = export_object(self.to, self._object(fit))
         say(f"{path}: {about}")
         return 0
 
     def _object(self, fit: Path) -> AlignedObject:
-        """The aligned object of a fit's file, with the observation that it holds."""
+        """Read the aligned object of a fit.json; raises DataError if the file cannot be used."""
         from cadalign.estimation.result import Result
         from cadalign.export.results import object_of
         from cadalign.io.observation import Observation
@@ -149,7 +153,7 @@ class Export:
 
         data = read_json(fit, FIT)
         if not isinstance(data, dict) or not isinstance(data.get("observation"), dict):
-            what = "the file holds no fit with the observation that was fitted"
+            what = "the file holds no fit with its observation"
             raise DataError(what, where=str(fit), fix="give the fit.json of `cadalign fit`")
         with in_file(fit):
             seen = Observation.from_dict(data["observation"], folder=fit.parent, needs_xyz=False)
@@ -157,7 +161,7 @@ class Export:
             if result.method == "align" and seen.shape is not None:
                 model = ShapeModel.open(seen.shape)
                 if tuple(model.ids) != result.ids:
-                    what = f"{len(model.ids)} keypoints that are not the fit's {len(result.ids)}"
+                    what = f"its {len(model.ids)} keypoints are not the fit's {len(result.ids)}"
                     raise DataError(what, where=str(seen.shape), fix="fit the observation again")
                 result = replace(result, model=model)
             exported = object_of(

@@ -1,4 +1,4 @@
-"""`cadalign observe`: pair a detector's keypoints with a model's."""
+"""`cadalign observe`: match a detector's keypoints to a model's keypoints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from cadalign.cli.common import answer, make_folder_of, say
-from cadalign.cli.options import CameraOptions, named_as_flags
+from cadalign.cli.options import CameraOptions, name_flags
 from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
 from cadalign.datasets.coco import decode_segmentation
 from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in
@@ -26,29 +26,30 @@ from cadalign.io.observation import Observation
 
 @dataclass(frozen=True)
 class Observe(CameraOptions):
-    """Pair the keypoints of a detector in a photo with a model's.
+    """Match a detector's keypoints to a model's keypoints.
 
-    Writes an observation for `cadalign fit`, which takes a whole file of many objects itself.
-    Keypoints are paired by name, otherwise by semantic id, otherwise by order. Without --camera or
-    --focal the focal length is unknown. The mask that stands beside COCO keypoints is written as
-    PNG beside the observation where the camera and the model's mesh are known, which a fit to it
-    needs.
+    Writes an observation of one object for `cadalign fit`. To align all objects of a detector's
+    file, give that file to `cadalign fit` directly. Keypoints are matched by name, otherwise by
+    semantic id, otherwise by order. Without --camera or --focal the focal length is unknown. The
+    mask of a COCO annotation is written as PNG beside the observation. It needs a known focal
+    length and the model's mesh, and is left out otherwise.
     """
 
     keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
-    """COCO keypoint JSON (MMPose, Detectron2, ultralytics), or CSV with the columns name, u, v."""
+    """The detector's file: COCO keypoint JSON (as from MMPose, Detectron2 or ultralytics), or CSV
+    with the columns name, u, v."""
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """The model: its keypoints, NAME.keypoints.json, or the mesh that these lie beside."""
+    """The model: its NAME.keypoints.json, or the mesh beside that file."""
     image: Path | None = None
-    """The photo; its name selects among the file's images."""
+    """The photo. Its name selects the image in the detector's file."""
     out: Path | None = None
-    """Observation file to write; by default <keypoints>.observation.json beside the keypoints."""
+    """Observation file to write; by default <keypoints>.observation.json beside KEYPOINTS."""
     object: int | None = None
-    """Number of the object in the photo, from 0; by default the one with the highest score."""
+    """Index of the object in the photo, from 0; by default the object with the highest score."""
     min_score: float = 0.0
-    """Least score of a keypoint that is kept."""
+    """Minimum score of a keypoint. Keypoints below it are left out."""
     ignore_unknown: bool = False
-    """Leave out keypoints that the model does not have."""
+    """Leave out keypoints that the model lacks."""
 
     def run(self) -> int:
         """Write the observation; returns the exit code."""
@@ -57,7 +58,7 @@ class Observe(CameraOptions):
         with in_file(self.model):
             check_keypoints(model.xyz, model.model, where="keypoints.xyz")
         name = None if self.image is None else str(self.image)
-        with named_as_flags(self):
+        with name_flags(self):
             found = choose_object(objects, image=name, number=self.object)
             observation = observed_in(
                 found,
@@ -76,7 +77,7 @@ class Observe(CameraOptions):
             observation.save(out)
         called = found.image or ""
         if name is not None and Path(called).suffix and not found.is_of(name):
-            say(f"{self.keypoints} calls the photo {called}; its keypoints count for {name}")
+            say(f"{self.keypoints} names the photo {called}; its keypoints are used for {name}")
         if observation.not_found:
             say(f"{found.source}: {observation.text_of_not_found}")
         for doubt in camera_doubts(observation.camera):
@@ -89,7 +90,7 @@ class Observe(CameraOptions):
     def _write_mask(
         self, observation: Observation, found: ImageKeypoints, path: Path
     ) -> Path | None:
-        """Write the mask beside the keypoints, if a fit can use it; its path."""
+        """Write the mask if a fit can use it; returns its path, or None."""
         camera = observation.camera
         if not camera.focal_known or observation.model is None:
             missing = "--camera" if not camera.focal_known else "the mesh of MODEL"

@@ -1,4 +1,4 @@
-"""Options that commands share, and errors that name them as the command line does."""
+"""Options that commands share, and errors that name the options of the command line."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ if TYPE_CHECKING:
 
 
 _FLAGS = {"fov_x": "--fov", "number": "--object"}
-"""Arguments of the library's functions that have another name on the command line."""
+"""Options of the command line whose name differs from the argument's."""
 
 
 @contextmanager
-def named_as_flags(*options: DataclassInstance, **others: str) -> Iterator[None]:
-    """Let errors about fields of dataclasses of options name the command line's options.
+def name_flags(*options: DataclassInstance, **others: str) -> Iterator[None]:
+    """Make errors about fields of options name the options of the command line.
 
-    ``others`` are flags of further arguments by name.
+    ``others`` are the flags of further arguments, by name.
     """
     flags = _FLAGS | flags_of(*options) | others
     try:
         yield
     except DataError as error:
-        if (error.fix or "").startswith("known are "):  # names of a file's fields, no options
+        if (error.fix or "").startswith("known are "):  # fields of a file, not options
             raise
-        raise DataError(error.what, where=error.where, fix=with_flags(error.fix, flags)) from None
+        raise DataError(error.what, where=error.where, fix=add_flags(error.fix, flags)) from None
     except InputError as error:
         where = flags.get(str(error.where), error.where)
-        what = str(with_flags(error.what, flags))
-        raise InputError(what, where=where, fix=with_flags(error.fix, flags)) from None
+        what = str(add_flags(error.what, flags))
+        raise InputError(what, where=where, fix=add_flags(error.fix, flags)) from None
 
 
 def flags_of(*options: DataclassInstance) -> dict[str, str]:
-    """The command line's options by the names of fields."""
+    """Return the flags of options, by the names of their fields."""
     names = [field.name for each in options for field in fields(each)]
     return {name: "--" + name.replace("_", "-") for name in names}
 
 
-def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
-    """A text that names flags in the place of arguments of several words, or in backquotes."""
+def add_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
+    """Replace names in backquotes or with an underscore by their flags."""
     for name, flag in flags.items():
         if text is not None:
             text = text.replace(f"`{name}`", flag)
@@ -63,7 +63,7 @@ def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ManyCommand(JsonOption, DetectorOptions):
-    """Options of the commands on one observation, or on many."""
+    """Options of commands on one or many observations."""
 
     out: Path | None = None
     observations: Annotated[
@@ -71,16 +71,16 @@ class ManyCommand(JsonOption, DetectorOptions):
         tyro.conf.Positional,
         tyro.conf.arg(metavar="OBSERVATION ...", help_behavior_hint="(required)"),
     ]
-    """A JSON file with camera and keypoints, optionally image, model and further evidence. Or many:
-    several such files, folders, JSON lines (.jsonl), or a detector's file of keypoints (COCO's
-    JSON, or CSV) with --camera and --model or --shape."""
+    """A JSON file with the camera and keypoints, and optionally the image, the model and further
+    evidence. For a run: several files, folders of files, JSON lines (.jsonl), or a detector's
+    keypoint file (COCO JSON or CSV) with --camera and --model or --shape."""
     picture: bool = True
-    """Draw box and keypoints over the photo, as overlay.png; of many observations, write a page."""
+    """Draw the box and keypoints over the photo (overlay.png); for a run, write report.html."""
     workers: int | None = None
-    """Processes for many observations; -1 for one for each core, 0 for none. By default -1, for few
-    observations 0."""
+    """Number of processes of a run: -1 for one per core, 0 to use none. By default -1, or 0 for
+    fewer than 200 observations."""
     dask: str | None = None
-    """Address of a Dask scheduler, whose workers are used instead."""
+    """Address of a Dask scheduler. Its workers are used instead of local processes."""
 
     @property
     def first(self) -> Path:
@@ -90,10 +90,10 @@ class ManyCommand(JsonOption, DetectorOptions):
             raise UsageError("no observation is given", where="OBSERVATION", fix=fix)
         return self.observations[0]
 
-    def only(self) -> Any:
-        """The parsed form of the only observation; None where there may be many.
+    def read_single(self) -> Any:
+        """Read the JSON of a single observation; returns None if there may be several.
 
-        What is for many observations alone is refused beside one.
+        Raises InputError if an option that only affects runs is given for a single observation.
         """
         path, data = self.first, None
         if path.suffix.lower() == ".json" and os.path.isfile(path):
@@ -111,13 +111,13 @@ class CameraOptions:
     """The calibrated camera."""
 
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K as text, or JSON in COLMAP's form: model, width,
-    height, params."""
+    """Camera calibration file: a 3 x 3 matrix K as text, or JSON with COLMAP's fields (model,
+    width, height, params)."""
     focal: float | None = None
-    """Focal length [px], where no file has it, or in its place."""
+    """Focal length [px]; overrides the value in the files."""
 
     @property
     def changes(self) -> ObservationChanges:
-        """Values of the options in the place of an observation's own."""
-        focal = None if isinstance(self.focal, str) else self.focal  # which a fit may estimate
+        """The camera that replaces the camera of an observation."""
+        focal = None if isinstance(self.focal, str) else self.focal  # "estimate" or "known"
         return ObservationChanges(self.camera, focal=focal)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cadalign.cli.common import make_folder_of, say
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.options import name_flags
 from cadalign.errors import InputError
 from cadalign.io.images import JPEG_ENDING
 
@@ -22,24 +22,22 @@ _ENDINGS = (".png", JPEG_ENDING)
 
 @dataclass(frozen=True)
 class Render:
-    """Draw a model: a still, or a contact sheet of several views.
-
-    One view gives a still, several give a contact sheet.
-    """
+    """Draw a model: one view, or a contact sheet of several views."""
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """OBJ, PLY, GLB, glTF, STL or OFF file."""
+    """The model: an OBJ, PLY, GLB, glTF, STL or OFF file."""
     out: Path = Path("render.png")
-    """File to write: .png or .jpg."""
+    """Picture to write: .png or .jpg."""
     view: tuple[str, ...] = ("iso",)
-    """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
-    degrees (write --view=-30,20 if it begins with a minus), or all."""
+    """Views to draw: iso, front, right, back, left, top, bottom, all of these (all), or
+    azimuth,elevation[,roll] in degrees. Write --view=-30,20 for a value that begins with a
+    minus."""
     resolution: str = "640x480"
-    """Width and height in pixels; of a contact sheet, each picture's."""
+    """Width and height of each view [px]."""
     keypoints: Path | None = None
-    """Keypoints to draw: the model's NAME.keypoints.json."""
+    """Keypoint file to draw: the model's NAME.keypoints.json."""
     fov: float = 35.0
-    """Horizontal field of view in degrees."""
+    """Horizontal field of view [degrees]."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
@@ -51,7 +49,7 @@ class Render:
         from cadalign.render.scene import Scene
         from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
-        with named_as_flags(self, elevation="--view"):
+        with name_flags(self, elevation="--view"):
             camera, views = self._camera(), self._views()
             scene, pictures = Scene(load_mesh(self.model)), {}
             xyz = None if self.keypoints is None else ModelKeypoints.load(self.keypoints).xyz
@@ -68,13 +66,16 @@ class Render:
         return 0
 
     def _camera(self) -> Any:
-        """The camera of each picture; what the options say is checked."""
+        """Return the camera of each picture; raises InputError if an option is invalid."""
         from cadalign.geometry.camera import Camera
         from cadalign.render.scene import check_image_size
 
         size = re.fullmatch(r"(\d{1,9})[xX](\d{1,9})", self.resolution.strip())
         if size is None or not (int(size[1]) and int(size[2])):
-            what, fix = f"{self.resolution!r} is no resolution", "give WIDTHxHEIGHT, as 640x480"
+            what, fix = (
+                f"{self.resolution!r} is not a resolution",
+                "give WIDTHxHEIGHT, such as 640x480",
+            )
             raise InputError(what, where="--resolution", fix=fix)
         camera = Camera.from_fov(int(size[1]), int(size[2]), fov_x=self.fov)
         check_image_size(camera)

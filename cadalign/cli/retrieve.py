@@ -1,4 +1,4 @@
-"""`cadalign retrieve`: rank a library's models by an image's keypoints; `library`: build one."""
+"""`cadalign retrieve`: rank a library's models by an image's keypoints; `cadalign library`."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from cadalign.cli.common import (
     print_json,
     print_table,
     say,
-    waiting,
+    show_status,
 )
-from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
+from cadalign.cli.options import CameraOptions, ManyCommand, name_flags
 from cadalign.errors import DataError, refuse_unused
 from cadalign.estimation.options import Sigma
 from cadalign.io.files import keeping, made_folder, refuse_input, require_utf8
@@ -35,46 +35,47 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _RetrievalOptions(RetrievalOptions):
-    """Ranking of the models; the observation file supplies the standard deviation."""
+    """Ranking of the models."""
 
     sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
 
     def __post_init__(self) -> None:
-        """Check nothing: options are checked once the command runs, and refused in one line."""
+        """Skip the checks: `run` makes them, and reports an error in one line."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
-    """Find the models of a library that explain an image's keypoints best.
+    """Find the models of a library that best explain an image's keypoints.
 
-    Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
-    keypoints need a semantic_id, or the name that the library has for it, and no xyz. A detector's
-    file needs no --model. With --out, writes matches.json, an overlay of each
-    match and its observation, and matches.png, which shows them side by side.
-    Many observations are a run, as of `cadalign fit`: it writes results.parquet and results.csv
-    with a row for each, and report.html.
+    Estimates pose and stretch of each model. The observation is a file as for `cadalign fit`. Its
+    keypoints need a semantic_id or a name that the library knows, but no xyz; a detector's file
+    needs no --model. With --out, writes matches.json, an overlay and an observation of each match,
+    and matches.png with all overlays side by side.
+
+    Several observations are a run, as with `cadalign fit`. It writes results.parquet and
+    results.csv, with a row per observation, and report.html.
     """
 
     out: Path | None = None
-    """Folder for matches.json and the matches' pictures; by default none is written. For many
-    observations the run's, by default beside them."""
+    """Output folder for matches.json and the pictures; by default nothing is written. For a run,
+    the folder of the run; by default beside the observations."""
     picture: bool = True
-    """Write a page of many observations."""
+    """For a run, write report.html."""
     ranking: Annotated[
         _RetrievalOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RetrievalOptions.__doc__)
     ] = _RetrievalOptions()
 
     def run(self) -> int:
-        """Run the retrieval, or the retrievals; returns the exit code."""
+        """Do the retrieval or the run; returns the exit code."""
         path = self.first
-        with named_as_flags(self, self.ranking):
+        with name_flags(self, self.ranking):
             how = ObservationRetrieval(
                 library=self.library,
                 shape=self.shape,
                 sigma=self.sigma,
                 ranking=RetrievalOptions(**vars(self.ranking)),
             )
-            data = self.only()
+            data = self.read_single()
             if data is None:
                 from cadalign.batch.retrievals import RetrieveRunOptions  # takes time to import
                 from cadalign.cli.runs import inputs_of, run_command
@@ -85,14 +86,14 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
             return self._retrieve(how.with_ids(query, str(path)), path, how)
 
     def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
-        """Retrieve the models of one observation, read of a path; returns the exit code."""
+        """Retrieve the models of one observation; returns the exit code."""
         from cadalign.retrieval.folder import none_text, write_retrieval
 
-        # The table needs no photo, which may have been moved.
+        # Only pictures need the photo: without them it may be missing.
         photo = None
         if self.out is not None and query.image is not None:
             photo = read_image(query.image, query.camera)
-        with waiting("retrieving (the first time after an installation takes a minute)"):
+        with show_status("retrieving (takes a minute at the first time)"):
             matches = how.retrieve(query, str(path))
         if self.json:
             print_json([match.to_dict() for match in matches])
@@ -134,11 +135,11 @@ def _print_table(matches: Sequence[Match]) -> None:
 
 @dataclass(frozen=True)
 class LibraryBuild:
-    """Build a library of own models, or of a data set's annotated ones, as one file."""
+    """Build a library file from your own models, or from the models of a data set."""
 
     root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-    """Folder of meshes with their NAME.keypoints.json, whose subfolders are categories; or one in
-    KeypointNet's layout."""
+    """Folder with a subfolder per category that holds meshes and their NAME.keypoints.json; or the
+    folder of a data set in KeypointNet's layout."""
     out: Path = Path("library.cadalign")
     """File to write."""
     categories: tuple[str, ...] | None = None
@@ -146,7 +147,7 @@ class LibraryBuild:
     split: str | None = None
     """Split of the data set to include, such as train; all models by default."""
     shapenet: Path | None = None
-    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
+    """ShapeNetCore folder with the meshes, if they are not inside FOLDER."""
 
     def run(self) -> int:
         """Build the library; returns the exit code."""
@@ -160,14 +161,14 @@ class LibraryBuild:
         files: Iterable[Path] = own
         dataset, total = None, len(own)
         if own:
-            with named_as_flags(self):
+            with name_flags(self):
                 unused = {"categories", "split", "shapenet"}
                 refuse_unused(self, unused, "on a folder of own models")
         else:
             dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
             dataset = dataset.subset(categories=self.categories, split=self.split)
             files, total = dataset.files, len(dataset.ids())
-        with keeping(files), waiting(f"reading {total:,} models"):
+        with keeping(files), show_status(f"reading {total:,} models"):
             refuse_input(self.out)
             make_folder_of(self.out)
             if dataset is None:
@@ -189,7 +190,7 @@ class LibraryShow:
     """Check a library file and list its models by category."""
 
     library: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LIBRARY")]
-    """File that `cadalign library build` wrote."""
+    """Library file of `cadalign library build`."""
 
     def run(self) -> int:
         """Open the library and describe it; returns the exit code."""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.progress import MofNCompleteColumn, Progress
 
-from cadalign.cli.common import beside, exit_code, new_console, print_json, print_table, say
-from cadalign.cli.options import flags_of, with_flags
+from cadalign.cli.common import exit_code, new_console, path_beside, print_json, print_table, say
+from cadalign.cli.options import add_flags, flags_of
 from cadalign.errors import DataError
 from cadalign.io.observation import DetectorOptions
 
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Run
 
 _MOST_REASONS, _MOST_OF_EVALUATIONS = 10, 3
-_SHOWN = 100
-"""Observations, the first ones, whose photos the page shows."""
-_ON_PAGE = 5000
-"""Observations beyond which the page is left to `cadalign report`."""
+_PICTURES = 100
+"""Number of observations with pictures on the page, from the first."""
+_MOST_ON_PAGE = 5000
+"""Largest number of observations for which the page is written without `cadalign report`."""
 
 
 def conclude(spec: Spec, run: Run, *, json: bool) -> int:
-    """Write a finished run's summary and figures, and say what came out; returns the exit code.
+    """Write and print the summary of a finished run, and draw figures; returns the exit code.
 
     Raises DataError if the run has no row.
     """
     if not len(run.results):
         given = run.config.get("categories")
-        what = "there is nothing that the run was made of"
-        what += f": no object is of the categories {', '.join(given)}" if given else ""
-        fix = "give other categories or data, and another folder (--out), or remove this one"
+        what = "the run has no rows"
+        what += f": no object has the categories {', '.join(given)}" if given else ""
+        fix = "give other categories or data; also remove this folder or give another --out"
         raise DataError(what, where=str(run.folder.path), fix=fix)
     from cadalign.evaluation.runs.work import FAILED
 
@@ -69,7 +69,7 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
 
 
 def write_run_report(folder: RunFolder) -> None:
-    """Write a run's page at its end, and say where it is."""
+    """Write a run's page, and print its path."""
     from cadalign.report import write_report
 
     say(f"Report: {write_report([folder.path], folder.report)}")
@@ -77,8 +77,8 @@ def write_run_report(folder: RunFolder) -> None:
 
 @contextmanager
 def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
-    """Show a progress bar with the time left; yields what takes a run's progress."""
-    if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
+    """Show a progress bar with the time left; yields the function that updates it."""
+    if not sys.stderr.isatty():  # rich prints an empty line, before 14.3 even if disabled
         yield lambda state: None
         return
     columns = *Progress.get_default_columns(), MofNCompleteColumn()
@@ -88,24 +88,24 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
 
 
 def inputs_of(command: Any) -> dict[str, Any]:
-    """The fields of `FitRunOptions` that a command states."""
+    """Return the fields of `FitRunOptions` that a command sets."""
     names = DetectorOptions.__dataclass_fields__
     return {
         "inputs": command.observations,
         "changes": command.changes,
         "detector": DetectorOptions(**{name: getattr(command, name) for name in names}),
-        "pictures": _SHOWN if command.picture else 0,
+        "pictures": _PICTURES if command.picture else 0,
     }
 
 
 def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> int:
-    """Do the run of a command; returns the exit code, 3 where some observations have failed.
+    """Do the run of a command, and print the reasons of failures; returns the exit code.
 
-    ``done`` is what was done to those that have not. The reasons of failures are said.
+    ``done`` says what was done to the other observations, such as "aligned".
     """
     import pyarrow.parquet as pq
 
-    from cadalign.batch.outputs import WARNED, warnings_text
+    from cadalign.batch.outputs import WARNING_COLUMNS, warnings_text
     from cadalign.batch.runs import run_many
 
     folder = run_folder(command, options)
@@ -116,31 +116,31 @@ def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> i
         print_json(pq.read_table(folder.results).to_pylist())
     total, reasons = _reasons(folder)
     failed = sum(count for _, count in reasons)
-    _say_reasons([(_as_typed(reason, command), count) for reason, count in reasons])
+    _say_reasons([(_typed_reason(reason, command), count) for reason, count in reasons])
     table = folder.path / "results.csv"
-    if said := warnings_text(pq.read_table(folder.results, columns=list(WARNED))):
-        say(said)
+    if text := warnings_text(pq.read_table(folder.results, columns=list(WARNING_COLUMNS))):
+        say(text)
     say(f"{total - failed:,} of {total:,} {done}, {failed:,} failed: {table}")
-    if command.picture and total <= _ON_PAGE:
+    if command.picture and total <= _MOST_ON_PAGE:
         write_run_report(folder)
     return exit_code(failed, total)
 
 
-def _as_typed(reason: str, command: ManyCommand) -> str:
-    """A failure's reason whose remedy names the command line's options, not fields of a file."""
+def _typed_reason(reason: str, command: ManyCommand) -> str:
+    """The reason of a failure, with the options of the command line in its remedy."""
     what, mark, fix = reason.rpartition("; ")
     if fix.startswith("known are"):
         return reason
-    return f"{what}{mark}{with_flags(fix, flags_of(command)) if mark else fix}"
+    return f"{what}{mark}{add_flags(fix, flags_of(command)) if mark else fix}"
 
 
 def _reasons(folder: RunFolder) -> tuple[int, list[tuple[str, int]]]:
-    """Number of rows of a run, and reasons of failures with their numbers, the commonest first."""
+    """Count the rows of a run, and its failures by reason, the most frequent first."""
     from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
     from cadalign.evaluation.runs.work import FAILED
 
     counts: Counter[str] = Counter()
-    whole: dict[str, str] = {}  # with the source, which tells what the only failure is of
+    whole: dict[str, str] = {}  # with the source, for reasons that occur once
     total = 0
     for table in read_groups(folder.results, fix=DONE_ANEW):
         total += len(table)
@@ -156,7 +156,7 @@ def _reasons(folder: RunFolder) -> tuple[int, list[tuple[str, int]]]:
 
 
 def _say_reasons(reasons: Sequence[tuple[str, int]], *, most: int = _MOST_REASONS) -> None:
-    """Say how many rows failed why, the commonest first."""
+    """Print the most frequent reasons of failures with their counts."""
     for reason, count in reasons[:most]:
         say(f"failed {count:,}: {reason}")
     rest = reasons[most:]
@@ -166,7 +166,7 @@ def _say_reasons(reasons: Sequence[tuple[str, int]], *, most: int = _MOST_REASON
 
 
 def run_folder(command: ManyCommand, options: FitRunOptions) -> RunFolder:
-    """The run's folder, by default beside the first input."""
+    """Return the run's folder, by default beside the first input."""
     from cadalign.evaluation.runs.folder import RunFolder
 
     kind, first = options.experiment, command.first
@@ -174,4 +174,4 @@ def run_folder(command: ManyCommand, options: FitRunOptions) -> RunFolder:
         return RunFolder(command.out)
     if len(command.observations) > 1 or not os.path.exists(first):
         return RunFolder(first.parent / kind)
-    return RunFolder(beside(first, f"_{kind}"))
+    return RunFolder(path_beside(first, f"_{kind}"))

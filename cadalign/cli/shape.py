@@ -9,47 +9,47 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.common import answer, group_of, make_folder_of, say, waiting
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.common import answer, group_of, make_folder_of, say, show_status
+from cadalign.cli.options import name_flags
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
 
 if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel
 
-_MODES = 5  # whose share of the variance is listed
+_MODES = 5  # that `show` describes by their share of the variance
 
 
 @dataclass(frozen=True)
 class ShapeLearn:
-    """Learn the shapes of a category from a data set's annotated models, as one file."""
+    """Learn the shape model of a category from a data set's annotated models."""
 
     root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
-    """Folder in KeypointNet's layout."""
+    """Folder of a data set in KeypointNet's layout."""
     category: str
     """Category to learn, such as chair."""
     out: Path | None = None
-    """File to write; by default <category>.shape."""
+    """Shape file to write; by default <category>.shape."""
     split: str | None = None
     """Split of the data set to learn from, such as train; all models by default."""
     shapenet: Path | None = None
-    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
+    """ShapeNetCore folder with the meshes, if they are not inside ROOT."""
     components: int | None = None
-    """Number of Gaussians; chosen by the likelihood of held-out models by default."""
+    """Number of Gaussian components; by default chosen by the likelihood of held-out models."""
 
     def run(self) -> int:
         """Learn the model; returns the exit code."""
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
-        with keeping(dataset.files), named_as_flags(self):
+        with keeping(dataset.files), name_flags(self):
             if self.out is not None:
                 refuse_input(self.out)
                 make_folder_of(self.out)
             return self._learn(dataset)
 
     def _learn(self, dataset: KeypointNet) -> int:
-        from cadalign.shapes.model import ShapeModel  # not for help of a command
+        from cadalign.shapes.model import ShapeModel  # takes time to import
 
-        with waiting(f"learning {self.category}"):
+        with show_status(f"learning {self.category}"):
             model = ShapeModel.from_dataset(
                 dataset, self.category, split=self.split, components=self.components
             )
@@ -61,10 +61,10 @@ class ShapeLearn:
 
 @dataclass(frozen=True)
 class ShapeShow:
-    """Describe a shape model."""
+    """Describe the shape model of a file."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
-    """File that `cadalign shape learn` wrote."""
+    """Shape file of `cadalign shape learn`."""
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
@@ -87,11 +87,11 @@ def _text(model: ShapeModel) -> str:
         lines.append(
             f"  component {number}  {100 * each.weight:.0f} %, {len(each.modes)} modes, of which "
             f"the first {_MODES} hold {held:.0f} % of the variance; standard deviation of a "
-            f"coordinate {sigma:.3g}, {each.residual_sigma:.2g} besides the modes"
+            f"coordinate {sigma:.3g}, {each.residual_sigma:.2g} beyond the modes"
         )
     return "\n".join(lines)
 
 
 ShapeCommand = group_of(
-    "Learn and inspect the shapes of categories.", {"learn": ShapeLearn, "show": ShapeShow}
+    "Learn and inspect shape models of categories.", {"learn": ShapeLearn, "show": ShapeShow}
 )

@@ -150,7 +150,7 @@ class ModelOptions(ExperimentOptions):
     """Selection of a dataset's models."""
 
     root: Annotated[Path, tyro.conf.Positional]
-    """Folder in KeypointNet's layout."""
+    """Folder of a data set in KeypointNet's layout."""
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
     """Categories to use; all by default."""

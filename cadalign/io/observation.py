@@ -301,11 +301,11 @@ class DetectorOptions:
     Keypoints are paired by name, otherwise by semantic id, otherwise by order. With --shape, the
     shape's keypoints by default."""
     images: Path | None = None
-    """Folder of the photos that a detector's file names."""
+    """Folder of the photos of a detector's file; by default the folder of that file."""
     min_score: float = 0.0
     """Lowest score of a detector's keypoints that are used."""
     ignore_unknown: bool = False
-    """Leave out a detector's keypoints that the model does not have."""
+    """Leave out a detector's keypoints that the model lacks."""
 
 
 @once_per_file(64)  # many observations may share a camera file

@@ -53,7 +53,7 @@ class RetrievalOptions:
     stretch: str | None = None
     """Axes whose stretch is estimated: "y", "z" or "none"; by default both y and z."""
     top: int = 10
-    """Largest number of matches to return."""
+    """Maximum number of matches."""
     category: str | None = None
     """Name or synset id of the category to search; by default all."""
     shape_sigma: float = 0.0

@@ -26,7 +26,7 @@ class ObservationRetrieval:
     """Settings of retrievals by observations."""
 
     library: Path
-    """File that `cadalign library build` wrote."""
+    """Library file of `cadalign library build`."""
     shape: Path | None = None
     """File that `cadalign shape learn` wrote. With it, models of its category are ranked by their
     similarity to the shape estimated from the keypoints, for objects not in the library."""

@@ -1,4 +1,4 @@
-"""Evidence beyond keypoints in an observation file: kept, used as `cadalign fit` does, named."""
+"""Evidence besides keypoints in an observation file: kept, used as by `cadalign fit`, named."""
 
 from __future__ import annotations
 
@@ -110,6 +110,6 @@ def test_evidence_outlives_the_last_pair(case: Case) -> None:
 def test_several_views_are_refused(case: Case) -> None:
     observed(case, "views").save(case.observation)
     before = case.observation.read_bytes()
-    with pytest.raises(CadalignError, match="has 2 views, the annotator opens files of one photo"):
+    with pytest.raises(CadalignError, match="has 2 views, the annotator only opens files of one"):
         case.open()
     assert case.observation.read_bytes() == before

@@ -13,7 +13,7 @@ from cadalign import Camera, fit
 from cadalign.annotate.marks import ObjectShape
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of
-from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem
+from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors
 from cadalign.annotate.session import LiveAlignment, missing_text
 from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.mesh import Mesh
@@ -44,11 +44,11 @@ def estimate_of(
         ids=np.arange(len(problem.points_3d)),
         fit_options={"stretch_sigma": stretch},
     )
-    return LiveProblem.of(Known(STRETCHED, BOX, focal=500.0), observation).estimate()
+    return LiveProblem.make(Priors(STRETCHED, BOX, focal=500.0), observation).estimate()
 
 
 def live_of(problem: SimulatedProblem, **options: Any) -> LiveAlignment:
-    """The same as the page shows it."""
+    """The live alignment of a problem, as the page shows it."""
     counts = np.ones(len(problem.points_3d), dtype=bool)
     return LiveAlignment(estimate_of(problem, **options), counts=counts)
 
@@ -86,14 +86,14 @@ def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
 
 
 def test_clicks_without_a_stated_noise_have_it_found_beside_other_evidence() -> None:
-    """By the prior on the stretch; a stated one counts."""
+    """The noise is estimated unless the observation has a sigma."""
     problem = problem_of(3, points=8, noise_px=2.0)
     upright = ImageEvidence(up=problem.alignment.rotation[:, 1])
     given = problem.points_3d, problem.points_2d, problem.camera
-    for sigma, settles in ((None, True), (np.full(8, 2.0), False)):
+    for sigma, estimates_noise in ((None, True), (np.full(8, 2.0), False)):
         noted = {"sigma": sigma, "ids": np.arange(8), "evidence": upright}
         seen = Observation(*given, **noted)
-        assert LiveProblem.of(Known(STRETCHED, BOX), seen).settles == settles
+        assert LiveProblem.make(Priors(STRETCHED, BOX), seen).estimates_noise == estimates_noise
 
 
 def test_pairs_that_leave_the_stretch_open_have_its_prior() -> None:

@@ -1,4 +1,4 @@
-"""One annotator a folder: what a second one is told, and what a stopped one leaves."""
+"""One annotator per folder: the refusal of a second one, and the files of a stopped one."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def annotator(case: Case, photo: Path, *arguments: object) -> Iterator[Annotator
 
 
 def second(case: Case, capsys: pytest.CaptureFixture[str], photo: Path, *arguments: object) -> str:
-    """The line by which a second annotator is refused."""
+    """Start a second annotator; returns its error."""
     given = photo, case.model, "--no-open", "--camera", case.camera, *arguments
     return refusal_line(capsys, "annotate", *given)
 
@@ -82,7 +82,7 @@ def test_second_process_is_refused_and_a_killed_one_leaves_no_lock(
         message = second(case, capsys, case.photo)
         assert message == (
             f"{case.folder}: another annotator has this folder open; "
-            "go on in its page or end it, or give another --observation or --out"
+            "use or close its page, or give another --observation or --out"
         )
         assert second(case, capsys, case.folder) == message
         first.act({"do": "place_uv", "uv": [30, 40]})
@@ -139,7 +139,7 @@ class Stop(BaseException):
 
 
 def content(state: dict[str, Any]) -> dict[str, Any]:
-    """What a person has put in, of a state of the page."""
+    """The user's input in a state of the page."""
     pairs = [[pair["uv"], pair["keypoint"], pair["name"]] for pair in state["pairs"]]
     evidence = state["evidence"]
     return {
@@ -164,7 +164,7 @@ def content(state: dict[str, Any]) -> dict[str, Any]:
 def test_stopped_before_any_write_an_action_is_done_or_not(
     case: Case, action: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every file that an action writes is the last one, in turn."""
+    """The process ends at each write of an action, in turn."""
     arguments: dict[str, dict[str, Any]] = {
         "place_keypoint": {"keypoint": case.clicks[4][0]},
         "release": {"pair": 2},

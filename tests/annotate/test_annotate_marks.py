@@ -36,7 +36,7 @@ def test_halves_fill_the_oldest_gap_unless_another_pair_is_preferred() -> None:
     preferred, number = marks.place_keypoint(7, preferred=3)
     assert number == 3
     assert preferred.pair(3).complete
-    # A pair that has this half already cannot be filled: the oldest gap is.
+    # The preferred pair has this half already: the oldest incomplete pair gets it.
     _, number = first.place_keypoint(8, preferred=1)
     assert number == 2
 
@@ -76,7 +76,7 @@ EDITS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), max_size=25)
 
 
 def edited(marks: Marks, edit: int, which: int) -> Marks:
-    """One of all kinds of edits, on one of the pairs if there are any."""
+    """Apply one kind of edit, to one of the pairs if there are any."""
     numbers = [pair.number for pair in marks.pairs]
     if edit == 0 or not numbers:
         return marks.place_uv((float(which), 1.0))[0]
@@ -154,7 +154,7 @@ def test_points_without_id_or_name_get_free_ones() -> None:
         5: "seat (2)",
         added: f"point {added}",
     }
-    assert registry.given == {4, 5}
+    assert registry.file_ids == {4, 5}
     assert added == 6
 
 
@@ -189,4 +189,4 @@ def test_points_of_an_earlier_session_are_taken_in() -> None:
     )
     names = {number: point.name for number, point in registry}
     assert names == {0: "renamed", 1: "b", 7: "placed", 8: "elsewhere"}
-    assert registry.given == {0, 1, 7, 8}
+    assert registry.file_ids == {0, 1, 7, 8}

@@ -80,7 +80,7 @@ def test_mask_of_a_file_is_not_changed(case: Case) -> None:
     assert (read_grey(case.folder / "photo.mask-2.png") != 0)[10, 10]
     perform(again, 0, {"do": "undo"})
     assert json.loads(case.observation.read_text())["mask"] == "photo.mask.png"
-    # Masks are no photos of the folder.
+    # Masks do not count as photos of the folder.
     names = [state.photo.path.name for state in case.open(image=case.folder).photos]
     assert names == ["photo.png"]
 

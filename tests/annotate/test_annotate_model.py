@@ -1,4 +1,4 @@
-"""Exact points on the model, whatever is shown of it."""
+"""Picked points lie on the exact model, not on the simplified display."""
 
 from __future__ import annotations
 
@@ -123,10 +123,10 @@ def test_wireframe_shows_the_edges_that_are_seen() -> None:
     model = ClickableModel(box_mesh())
     turn = np.array([[0.8, 0, 0.6], [0.36, 0.8, -0.48], [-0.48, 0.6, 0.64]])
     alignment = Alignment(turn, [0, -0.5, 9], [1, 1.2, 0.7])
-    lines = model.wireframe.seen_in(CAMERA, alignment)
+    lines = model.wireframe.project(CAMERA, alignment)
     assert lines.shape[1:] == (2, 2)
     corners = CAMERA.project(alignment.apply(model.scene.mesh.vertices))
-    # Of a box's 8 corners one is hidden, and three of its edges.
+    # One corner of a box and three edges are hidden.
     gaps = np.linalg.norm(corners[:, None] - lines.reshape(-1, 2), axis=2).min(axis=1)
     assert (gaps < 1e-6).sum() == 7
     edges = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()
@@ -138,7 +138,7 @@ def test_wireframe_shows_the_edges_that_are_seen() -> None:
 def test_wireframe_shows_the_outline_of_smooth_models() -> None:
     model = ClickableModel(sphere(40))
     alignment = Alignment(np.eye(3), [-3, 1, 4], [1, 1, 1])  # the sphere's centre at depth 6
-    lines = model.wireframe.seen_in(CAMERA, alignment)
+    lines = model.wireframe.project(CAMERA, alignment)
     assert len(lines) > 40
     ends = CAMERA.normalize(lines.reshape(-1, 2))
     angle = np.arctan(np.linalg.norm(ends, axis=1))
@@ -148,5 +148,5 @@ def test_wireframe_shows_the_outline_of_smooth_models() -> None:
 def test_lines_behind_the_camera_are_left_out() -> None:
     model = ClickableModel(box_mesh())
     behind = Alignment(np.eye(3), [0, 0, -9], [1, 1, 1])
-    assert model.wireframe.seen_in(CAMERA, behind).shape == (0, 2, 2)
+    assert model.wireframe.project(CAMERA, behind).shape == (0, 2, 2)
     assert box_lines(model.scene.bounds, CAMERA, behind).shape == (0, 2, 2)

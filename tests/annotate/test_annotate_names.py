@@ -1,4 +1,4 @@
-"""Names of the annotator's files: no photo's file is another's, however the photos are called."""
+"""Names of the annotator's files: every photo has its own, whatever its name."""
 
 from __future__ import annotations
 

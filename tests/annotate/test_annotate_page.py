@@ -58,7 +58,7 @@ COUNT_COLOR = """color => {
 
 
 class Driver:
-    """The page, and how to click on pixels of the photo and points of the model."""
+    """Driver of the page that clicks on pixels of the photo and points of the model."""
 
     def __init__(self, page: Page, session: Session) -> None:
         self.page = page
@@ -76,16 +76,16 @@ class Driver:
         pytest.fail("the state never came")
 
     def pixel(self, uv: list[float]) -> tuple[float, float]:
-        """Where a pixel of the photo is on the page."""
+        """Position on the page of a pixel of the photo."""
         return place_of_pixel(self.page, uv)
 
     def surface(self, xyz: np.ndarray) -> tuple[float, float]:
-        """Where a model point is on the page."""
+        """Position on the page of a model point."""
         place = self.page.evaluate("xyz => annotator.model.toPage(xyz)", xyz.tolist())
         return place["x"], place["y"]
 
     def eye(self) -> np.ndarray:
-        """Where the model is looked at from, in model coordinates."""
+        """Position of the viewer in model coordinates."""
         eye = self.page.evaluate("annotator.model.stage.camera.position.toArray()")
         return self.session.model.cad.from_display(eye)
 
@@ -322,7 +322,7 @@ def learned_shape(case: Case, ids: list[int], xyz: np.ndarray) -> Path:
 
 
 def test_shape_is_drawn_and_an_unknown_point_identified(browser: Browser, case: Case) -> None:
-    """Rings and regions of unmarked keypoints, and the choice which keypoint a point is."""
+    """Rings and regions of unmarked keypoints, and the identification of a point."""
     points = ModelKeypoints.load(case.keypoints)
     ids = [int(number or 0) for number in points.ids[1:]]
     file = learned_shape(case, ids, points.xyz[1:])
@@ -426,7 +426,7 @@ def test_a_box_and_one_key_align_to_the_photo(browser: Browser, case: Case) -> N
         page.keyboard.press("i")
         wait(page, f"{IDLE} && annotator.state.evidence.photo")
         expect(page.get_by_label("Fit to the photo itself")).to_be_checked()
-        expect(page.get_by_text("The photo takes the place of the mask")).to_be_visible()
+        expect(page.get_by_text("The photo replaces the mask")).to_be_visible()
         assert page.evaluate("annotator.state.alignment.also_used") == "photo"
         assert rotation_error(est=placed(session), gt=truth) < 1.0
         page.keyboard.press("Control+z")

@@ -68,7 +68,7 @@ def test_stored_options_that_the_page_does_not_use_are_named(
 
 
 def test_options_follow_the_pairs(case: Case) -> None:
-    """What was estimated for other pairs is not left in the file."""
+    """Estimates for earlier pairs do not stay in the file."""
     session = case.open()
     place_all(session, case)
     before = Observation.load(case.observation).fit_options

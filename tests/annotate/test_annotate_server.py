@@ -1,4 +1,4 @@
-"""The annotator's server refuses whoever is not the session's own page."""
+"""The annotator's server only answers its own page."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_unknown_photo_is_an_error_in_words(access: Access) -> None:
     [
         *(({"Origin": o}, 403) for o in ("https://evil.example", "null", "http://127.0.0.1:1", "")),
         *(({"Sec_Fetch_Site": site}, 403) for site in ("cross-site", "same-site")),
-        # Names that were made to lead here.
+        # Foreign names that resolve to this machine.
         *(({"Host": host}, 400) for host in ("evil.example", "", "127.0.0.1.evil.example:80")),
     ],
 )

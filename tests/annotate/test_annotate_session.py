@@ -1,4 +1,4 @@
-"""A session without its page: every action, what is written, and what is found again."""
+"""A session without its page: actions, written files, and reopening."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FROM_ABOVE = {"origin": [0.02, 3, 0.03], "direction": [0, -1, 0]}
 
 
 def comparable(state: dict[str, Any]) -> dict[str, Any]:
-    """A state without what a new session cannot know: undo, times, the pairs' own numbers."""
+    """A state without the parts of one session: undo, times, the numbers of pairs."""
     left_out = {"saved", "selected", "message", "can_undo", "can_redo"}
     kept = {key: value for key, value in state.items() if key not in left_out}
     kept["pairs"] = [{k: v for k, v in pair.items() if k != "pair"} for pair in state["pairs"]]
@@ -175,7 +175,7 @@ def test_an_observation_that_others_changed_is_not_written_over(case: Case) -> N
         perform(session, 0, action)
         assert page_state(session, 0)["saved"]["trouble"] == (
             f"{case.observation}: was changed by another program since the annotator read or wrote "
-            "it; rename it to have all marks saved, or start anew to go on with that file"
+            "it; rename it to save the marks of this session, or restart to go on from it"
         )
         assert json.loads(case.observation.read_text()) == data
     perform(session, 0, {"do": "undo"})
@@ -250,7 +250,7 @@ def test_click_near_a_keypoint_takes_it(case: Case) -> None:
             "direction: the vector is zero",
         ),
         ({"do": "move", "pair": 7, "uv": [1, 2]}, "pair: there is no pair 7; reload the page"),
-        ({"do": "focal", "pixels": 0}, "pixels: 0 px is no focal length of this"),
+        ({"do": "focal", "pixels": 0}, "pixels: 0 px is not a focal length of this"),
     ],
 )
 def test_bad_actions_are_refused_and_change_nothing(
@@ -290,7 +290,7 @@ def test_camera_of_an_observation_is_used(case: Case) -> None:
 
 
 def exif_photo(path: Path, *, orientation: int = 1, focal_35mm: int | None = None) -> None:
-    """A photo whose left half is red, stored as its EXIF orientation says."""
+    """Write a photo with a red left half, stored in the given EXIF orientation."""
     pixels = np.zeros((300, 400, 3), dtype=np.uint8)
     pixels[:, :200, 0] = 250
     image = Image.fromarray(pixels)
@@ -323,7 +323,7 @@ def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> 
     exif_photo(path, orientation=orientation)
     photo = PhotoFile.open(path)
     assert (photo.width, photo.height) == (400, 300)
-    kind, data = photo.encoded()
+    kind, data = photo.encode()
     assert kind == "image/jpeg"
     (case.folder / "shown.jpg").write_bytes(data)
     shown = np.asarray(Image.open(case.folder / "shown.jpg"))
@@ -405,7 +405,8 @@ def test_annotation_goes_on_with_a_renamed_model(
     former.rename(model)
     again = case.open(model=model, prepared=False)
     assert len(again.photos[0].marks.complete_pairs) == 3
-    assert f"{case.observation}: its model {former} is gone: {model} takes its place" in caplog.text
+    text = f"{case.observation}: its model {former} no longer exists, {model} is used instead"
+    assert text in caplog.text
     perform(again, 0, {"do": "delete", "pair": 1})
     assert Observation.load(case.observation).model == model
 
@@ -439,7 +440,7 @@ def test_given_keypoints_without_ids_all_come(case: Case) -> None:
     ModelKeypoints((given[0], *bare[1:])).save(case.keypoints)
     session = case.open()
     assert [point.name for _, point in session.model.registry] == [point.name for point in given]
-    assert len(session.model.registry.given) == len(given)
+    assert len(session.model.registry.file_ids) == len(given)
 
 
 def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
@@ -451,7 +452,7 @@ def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
     session = case.open()
     keypoints = [pair.keypoint for pair in session.photos[0].marks.pairs]
     assert keypoints[1:] == ids[1:]
-    assert keypoints[0] not in session.model.registry.given
+    assert keypoints[0] not in session.model.registry.file_ids
 
 
 def test_session_prepares_its_solvers_before_it_fits(case: Case) -> None:

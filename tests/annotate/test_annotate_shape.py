@@ -1,4 +1,4 @@
-"""The annotator with the object's own shape, of a learned category."""
+"""The annotator with a learned shape."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LACKING = 2  # keypoints of the model that the learned shape does not know
 
 
 def learn(points: np.ndarray, ids: list[Any]) -> ShapeModel:
-    """A category of stretched and distorted copies."""
+    """Learn the shape of stretched and distorted copies."""
     rng = np.random.default_rng(0)
     models = []
     for row in range(60):
@@ -80,7 +80,7 @@ def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path
     shape = ShapeModel.open(shape_file)
     assert state["shape"] == {"category": "chair", "missing": [77]}
     used = {number for number, _ in case.clicks} & set(shape.ids)
-    # All but the one that the model lacks.
+    # All keypoints except the one that the model lacks.
     assert len(drawn["unmarked"]) == len(drawn["regions"]) == len(shape.ids) - len(used) - 1
     assert len(drawn["lines"]) > 100
     assert len(drawn["box"]) == 12 * 16
@@ -89,7 +89,7 @@ def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path
 
 
 def test_points_that_the_shape_lacks_do_not_count(case: Case, shape_file: Path) -> None:
-    """They are not lost."""
+    """They are kept in the file."""
     session = case.open(shape=shape_file)
     state = place_all(session, case)
     lacking = [pair for pair in state["pairs"] if not pair["counts"]]
@@ -110,15 +110,15 @@ def test_points_that_the_shape_lacks_do_not_count(case: Case, shape_file: Path) 
 def test_points_of_the_model_can_be_identified(
     case: Case, shape_file: Path, sample_root: Path
 ) -> None:
-    """A new point does not get an id of the shape by chance, but on demand, and is saved."""
+    """A new point gets an id of the shape only if the user asks for it."""
     session = case.open(shape=shape_file)
     perform(session, 0, {"do": "pick", "origin": [0, 0.05, -3], "direction": [0, 0, 1]})
     (pair,) = page_state(session, 0)["pairs"]
     assert not pair["counts"]
     assert pair["keypoint"] > 77
-    with pytest.raises(CadalignError, match="no keypoint of the shape"):
+    with pytest.raises(CadalignError, match="not a keypoint of the shape"):
         perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 99})
-    with pytest.raises(CadalignError, match="has its keypoint 5 already"):
+    with pytest.raises(CadalignError, match="already has a keypoint 5"):
         perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 5})
     perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 77})
     state = page_state(session, 0)

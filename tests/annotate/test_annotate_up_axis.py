@@ -25,7 +25,7 @@ FROM_Y_UP = {
 
 
 def turned(case: Case, axis: str) -> Case:
-    """The same photo with the model turned such that an axis of it points up."""
+    """The same photo with the model turned so that the given axis points up."""
     mesh, path = load_mesh(case.model), case.folder / f"{axis}_up.obj"
     write_mesh(path, replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[axis].T), kind="obj")
     given = ModelKeypoints.load(case.keypoints)
@@ -72,7 +72,7 @@ def test_gravity_is_that_of_the_up_axis(case: Case, capsys: pytest.CaptureFixtur
 
 
 def up_on_screen(page: Page, axis: str) -> list[float]:
-    """Where a step along an axis of the model goes on the screen [px], y upwards."""
+    """Direction on the screen of a step along a model axis [px], y upwards."""
     step = {"x": [0.3, 0, 0], "y": [0, 0.3, 0], "z": [0, 0, 0.3]}[axis]
     return list(
         page.evaluate(

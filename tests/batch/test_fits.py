@@ -258,7 +258,7 @@ def test_the_how_to_names_every_column() -> None:
 
 
 class TestFitMany:
-    """Of observations that a program makes."""
+    """`fit_many` takes observations of a program."""
 
     def test_results_come_in_order_and_nothing_is_kept(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

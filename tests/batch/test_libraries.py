@@ -1,4 +1,4 @@
-"""Libraries that are written can be opened, whatever the coordinates."""
+"""Every library that was written can be opened, for all coordinates."""
 
 from __future__ import annotations
 

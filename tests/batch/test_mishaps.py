@@ -32,7 +32,7 @@ LIMITED = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000,
 
 
 def lines(path: Path, count: int, **fields: Any) -> Path:
-    """JSON lines of noisy observations, with fields in place of their own."""
+    """Write JSON lines of noisy observations with changed fields."""
     rng, texts = np.random.default_rng(0), []
     for _ in range(count):
         seen = Observation(POINTS, PIXELS + rng.normal(0, 1, PIXELS.shape), CAMERA)
@@ -153,7 +153,7 @@ def test_photos_of_several_folders_are_their_own(
 
 
 def coco(path: Path, *changes: dict[str, Any]) -> Path:
-    """A detector's file with an object for each change of its fields."""
+    """Write a detector's file with one object per change of fields."""
     flat = np.column_stack([PIXELS, np.full(8, 0.9)]).ravel().tolist()
     image = {"id": 1, "file_name": "a.png", "width": 640, "height": 480}
     entries = [{"image_id": 1, "category_id": 1, "keypoints": flat} | each for each in changes]

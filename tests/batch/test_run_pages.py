@@ -39,7 +39,7 @@ def observations(*, models: bool = False) -> Iterator[Observation]:
 
 
 def fit(out: Path, seen: Iterable[Observation], **options: Any) -> None:
-    """A run of observations, which stand as JSON lines beside it."""
+    """Do a run of observations; writes the observations as JSON lines beside it."""
     source = out.with_suffix(".jsonl")
     source.write_text("".join(json.dumps(each.to_dict()) + "\n" for each in seen))
     run_many(FitRunOptions(inputs=(source,), **options), out)

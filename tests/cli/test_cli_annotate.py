@@ -1,4 +1,4 @@
-"""`cadalign annotate` from the command line: it starts, says where, ends, and refuses in words."""
+"""`cadalign annotate` from the command line: start, address, end, and refusals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> N
 def test_folder_of_the_observation_is_made(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Refused only after the folder was made: a model that is none.
+    # The model is refused after the folder was made.
     observation = tmp_path / "new" / "dir" / "obs.json"
     refusal(capsys, case.photo, case.camera, "--observation", observation)
     assert observation.parent.is_dir()

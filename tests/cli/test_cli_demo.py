@@ -38,7 +38,7 @@ def picture_of(out: Path, row: dict[str, str]) -> Path:
 
 
 def count_color(path: Path, channel: int) -> int:
-    """Number of the pixels in which a channel of RGB is far above the others."""
+    """Count the pixels in which one channel of RGB dominates."""
     picture = cv2.imread(str(path))
     assert picture is not None
     rgb = picture[..., ::-1].astype(int)
@@ -135,7 +135,7 @@ def test_without_a_root_the_sample_data_set_is_made(tmp_path: Path) -> None:
 
 @pytest.fixture
 def root(sample_root: Path, tmp_path: Path) -> Path:
-    """A copy of the sample data set that may be spoilt."""
+    """A copy of the sample data set, to damage."""
     return Path(shutil.copytree(sample_root, tmp_path / "spoilt"))
 
 

@@ -65,7 +65,7 @@ def test_the_command_says_what_is_missing(
     said = refusal(capsys, result, "--to", tmp_path / "a.json")
     assert "the name does not tell the format" in said
     Result.load(result).save(result)  # which writes no observation
-    assert "the file holds no fit with the observation" in refusal(capsys, result, *to)
+    assert "the file holds no fit with its observation" in refusal(capsys, result, *to)
     result.write_text(result.read_text()[:200])
     assert f"{result}, line" in refusal(capsys, result, *to)
     assert "no such file" in refusal(capsys, tmp_path / "gone.json", *to)
@@ -106,7 +106,7 @@ def test_views_and_warped_mesh_of_a_joint_fit(tmp_path: Path, observed: Path) ->
     target = tmp_path / "first.ply"
     assert main(["export", str(result), "--to", str(target)]) == 0
     mesh = load_mesh(target)
-    # Keypoints 0 and 1 are vertices of the wedge; the object's are where the mesh was warped to.
+    # Keypoints 0 and 1 are vertices of the wedge: the warp moves both to the object's keypoints.
     placed = POSE.apply(object_points)
     assert np.linalg.norm(mesh.vertices[[0, 1]] - placed[[0, 1]], axis=1).max() < 0.02
     assert (

@@ -1,4 +1,4 @@
-"""`cadalign fit`: what it prints and writes, and one line for whatever is wrong."""
+"""`cadalign fit`: its output, its files, and errors in one line."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ UP = TRUTH.rotation[:, 1]
 
 
 def observed(angle: float = 0.0, rows: slice = slice(None), **evidence: Any) -> ObservedImage:
-    """An image of some keypoints from a place around the object, with half a pixel of noise."""
+    """An image of keypoints from an angle around the object, with 0.5 px of noise."""
     noise = np.random.default_rng(int(angle)).normal(0, 0.5, POINTS.shape[:1] + (2,))
     pixels = CAMERA.project(in_camera(POINTS, TRUTH, around(angle))) + noise
     ids = np.arange(len(POINTS))[rows]
@@ -110,7 +110,7 @@ def test_keypoints_without_ids_are_the_same_at_the_same_point(tmp_path: Path) ->
 
 
 def without_focal(path: Path) -> Path:
-    """Take the focal lengths away from the cameras of a file."""
+    """Remove the focal lengths from the cameras of a file."""
     data = json.loads(path.read_text())
     for image in data.get("views", [data]):
         image["camera"] = {"width": 640, "height": 480}
@@ -161,7 +161,7 @@ def write_box(folder: Path, truth: Alignment) -> np.ndarray:
 
 
 def _note_opened(opened: list[str], folder: str, event: str, arguments: Any) -> None:
-    # Of a call by another one, os.open of open, the mode is None.
+    # open() calls os.open(), for which the mode is None.
     is_first = event == "open" and arguments[1] is not None
     if is_first and str(arguments[0]).startswith(folder):
         opened.append(str(arguments[0]))
@@ -261,8 +261,8 @@ def test_one_keypoint_at_two_points_is_refused(
     moved = replace(observed(25.0), points_3d=POINTS + [[0, 0, 1e-3]])
     path = write(tmp_path, observed(), moved)
     assert refusal_line(capsys, "fit", path) == (
-        f"{path}: views[1].keypoints[0].xyz: differs from that of keypoint 0 in a view before; "
-        "give the same point of the model"
+        f"{path}: views[1].keypoints[0].xyz: differs from the xyz of keypoint 0 in an earlier "
+        "view; give the same xyz in all views"
     )
 
 

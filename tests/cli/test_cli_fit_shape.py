@@ -42,7 +42,7 @@ TRUTH = Alignment(np.diag([1.0, -1, -1]) @ np.array([[0.8, 0, 0.6], [0, 1, 0], [
 
 
 def boxes(ids: Any) -> ShapeModel:
-    """The shape of boxes, whose lengths differ by a tenth."""
+    """A shape model of boxes whose lengths vary by 10 %."""
     rng = np.random.default_rng(0)
     models = []
     for row in range(40):
@@ -58,7 +58,7 @@ def numbered() -> ShapeModel:
 
 
 def write(folder: Path, count: int = 6, **fields: Any) -> Path:
-    """An observation of a box's first corners, some noise, and corners of the unit box as xyz."""
+    """Write an observation of a box's first corners, with noise; xyz is the unit box."""
     noise = np.random.default_rng(1).normal(0, 0.5, (8, 2))
     pixels = CAMERA.project(TRUTH.apply(CORNERS * RIGHT)) + noise
     fields = {"ids": np.arange(count), **fields}
@@ -164,7 +164,7 @@ def test_prior_on_a_focal_length_is_that_of_the_file_and_flags_say_otherwise(
     printed = capsys.readouterr()
     found = align(numbered, view, loss="huber", focal="estimate", focal_prior=prior)
     assert printed.out == f"{found}\n"
-    assert "Focal length is estimated, its prior: 905 px +- 1 %" in printed.err
+    assert "The focal length is estimated with the prior 905 px +- 1 %" in printed.err
     assert main(["fit", str(path), "--focal", "known"]) == 0
     assert capsys.readouterr().out == f"{align(numbered, view, loss='huber')}\n"
     path = without_focal(path)
@@ -212,7 +212,7 @@ def test_a_shape_that_was_replaced_is_not_exported(
     boxes(range(1, 9)).save(tmp_path / "box.shape")
     capsys.readouterr()
     line = refusal_line(capsys, "export", tmp_path / "box_fit", "--to", tmp_path / "box.glb")
-    what = f"{tmp_path / 'box.shape'}: 8 keypoints that are not the fit's 8; fit the observation"
+    what = f"{tmp_path / 'box.shape'}: its 8 keypoints are not the fit's 8; fit the observation"
     assert what in line
 
 
@@ -229,7 +229,7 @@ def test_a_shape_that_was_replaced_is_not_exported(
         (
             {"ids": None, "names": NAMES[:6]},
             "keypoints: the keypoints have no semantic_id; "
-            "the shape of box knows its keypoints by their semantic ids",
+            "the shape of box identifies its keypoints by their semantic ids",
         ),
         (
             {"ids": np.array([0, 1, 2, 3, 1, 5])},
@@ -257,7 +257,7 @@ def test_keypoints_that_the_shape_cannot_take_are_named(
         ("--shape none.shape", "none.shape: no such file"),
         (
             "--shape box.shape --shape-sigma 0.1",
-            "--shape-sigma: --shape has learned how far objects of the category differ; "
+            "--shape-sigma: has no effect together with a learned shape; "
             "give one of the two options",
         ),
         *(

@@ -28,7 +28,7 @@ QUARTER = rotation_from_vector(np.pi / 2 * UP)
 
 
 def write_observation(folder: Path, name: str = "box.json", **fields: Any) -> Path:
-    """A box of a square base, its photo grey, its keypoints exact."""
+    """Write an observation of a box with a square base: grey photo, exact keypoints."""
     trimesh.creation.box(2 * HALF).export(folder / "box.obj")
     write_image(folder / "photo.png", np.full((240, 320, 3), 90, np.uint8))
     points = fields.pop("points", CORNERS)

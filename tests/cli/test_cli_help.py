@@ -1,4 +1,4 @@
-"""Help of every command: each option is described once, and its default told once."""
+"""Help of every command: each option is described once, and its default stated once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PATHS = (
 
 @cache
 def printed(path: str) -> str:
-    """What a command prints for --help, without colours, in one column."""
+    """The --help of a command, without colours."""
     out = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
         patch.setenv("COLUMNS", "96")
@@ -31,14 +31,14 @@ def printed(path: str) -> str:
 
 
 def subcommands(path: str) -> set[str]:
-    """Names of what stands below a command, from its usage line."""
+    """Names of the subcommands in the usage line of a command."""
     usage, _, rest = printed(path).partition("\n\n")
     found = re.search(r"\{([a-z,-]+)\}", usage)
     return set(found.group(1).split(",")) if found and "subcommands" in rest else set()
 
 
 def options(path: str) -> dict[str, str]:
-    """The options of a command and what the help says of each, on one line."""
+    """The options of a command, each with its help on one line."""
     found: dict[str, str] = {}
     name = ""
     for line in printed(path).splitlines():

@@ -1,4 +1,4 @@
-"""What the commands import, and what starting them costs: nothing that a call does not use."""
+"""Imports and start-up cost of commands: a call imports only what it uses."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ print("\\n" + json.dumps(found))
 
 
 def modules_after(*commands: Sequence[str]) -> list[tuple[int, set[str]]]:
-    """Exit codes of commands, one after the other in one process, and the modules it has then."""
+    """Run commands in one process; returns the exit code and all imported modules after each."""
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(commands)],
         capture_output=True,
@@ -81,7 +81,7 @@ def test_the_list_of_commands_imports_nothing_heavy() -> None:
 
 
 def test_help_of_a_command_imports_no_more_than_numpy() -> None:
-    """In one process for all commands: the first that imports more is named."""
+    """All commands run in one process: the first failure names the culprit."""
     found = modules_after(*([command, "--help"] for command in sorted(COMMANDS)))
     for command, (code, modules) in zip(sorted(COMMANDS), found, strict=True):
         assert (code, HEAVY & modules - {"numpy", "rich"}) == (0, set()), command
@@ -123,7 +123,7 @@ def test_other_fits_import_no_mesh_library(fits: list[set[str]]) -> None:
 
 
 def command_line(*arguments: str) -> Measure:
-    """Measure a command in a process of its own, once Python has started."""
+    """Measure a command in its own process, without the start of Python."""
     program = (
         "import contextlib, io\nfrom cadalign.cli import main\n"
         "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):\n"

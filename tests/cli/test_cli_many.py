@@ -49,7 +49,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def write_observations(folder: Path) -> Path:
-    """An observation of each object, in a folder."""
+    """Write an observation of each object into a folder."""
     out = folder / "seen"
     out.mkdir()
     for name, image, pose in zip(("a_0", "a_1", "b"), ("a.png", "a.png", None), POSES, strict=True):
@@ -99,7 +99,7 @@ def test_a_detectors_file_needs_no_observations(
     assert rows[1]["source"].endswith("found.json: annotations[1]")
     capsys.readouterr()
     assert main(["fit", str(folder / "found.json"), *camera, *out]) == 1
-    assert "--model: the keypoints of the model are not known; give the" in capsys.readouterr().err
+    assert "--model: a detector's file needs a model; give the" in capsys.readouterr().err
 
 
 def test_a_camera_that_cannot_be_read_is_refused_before_the_run(

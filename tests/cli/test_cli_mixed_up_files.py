@@ -1,4 +1,4 @@
-"""Files given in each other's place, and folders: refused in one line, by what they are."""
+"""Mixed-up files and folders are refused in one line that names their kind."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = [f"corner {row}" for row in range(10)]
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder, the present one, with an observation, a mesh, a photo and keypoints of both."""
+    """The current folder, with an observation, a mesh, a photo and keypoint files of both."""
     monkeypatch.chdir(tmp_path)
     model, camera = Path("model.obj"), PROBLEM.camera
     model.write_text(TETRAHEDRON)
@@ -110,7 +110,7 @@ def test_another_name_of_the_photo_is_said(
 ) -> None:
     assert main(["observe", "found.json", "model.keypoints.json", "--image", "photo.png"]) == 0
     said = capsys.readouterr().err
-    assert "found.json calls the photo elsewhere.jpg; its keypoints count for photo.png" in said
+    assert "found.json names the photo elsewhere.jpg; its keypoints are used for photo.png" in said
 
 
 def test_unknown_field_is_answered_by_fields(
@@ -131,5 +131,5 @@ def test_folder_is_no_mesh(folder: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_exchanged_arguments_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["annotate", "model.obj", "photo.png", "--no-open"])
-    text = "PHOTO MODEL: model.obj is a mesh and photo.png a photo: they are exchanged"
+    text = "PHOTO MODEL: model.obj is a mesh and photo.png is a photo: swap them"
     assert text in capsys.readouterr().err

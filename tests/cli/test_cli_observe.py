@@ -98,7 +98,7 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     result = fitted(folder, "found.observation")
     captured = capsys.readouterr()
     focal = 34 / np.hypot(36, 24) * 800
-    assert f"its prior: {focal:.4g} px +- 5 %, the photo's EXIF data" in captured.err
+    assert f"with the prior {focal:.4g} px +- 5 %, the photo's EXIF data" in captured.err
     assert "  focal length " in captured.out
     prior = FocalPrior.from_exif(folder / "photo.jpg")
     expected = fit(
@@ -206,7 +206,7 @@ def test_mask_that_a_fit_cannot_use_is_left_out(
 
 
 def coco(folder: Path, **changes: Any) -> Path:
-    """COCO's annotations of the photo, with changes to the image's and the object's fields."""
+    """Write COCO annotations of the photo, with changed fields of image and object."""
     flat = np.column_stack([POINTS_2D, np.full(24, 2)]).ravel().tolist()
     image = {"id": 1, "file_name": "photo.jpg", "width": 640, "height": 480}
     entry = {"id": 1, "image_id": 1, "category_id": 1, "keypoints": flat}
@@ -219,7 +219,7 @@ def coco(folder: Path, **changes: Any) -> Path:
 
 
 def mesh_of_keypoints(folder: Path) -> dict[str, Any]:
-    """Write a mesh whose vertices are the keypoints; returns the content of their file with it."""
+    """Write a mesh whose vertices are the keypoints; returns the content of the keypoint file."""
     vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in POINTS_3D.tolist())
     corners = " ".join(map(str, range(1, 25)))
     (folder / "model.obj").write_text(f"{vertices}f {corners}\n")
@@ -278,7 +278,7 @@ def test_keypoints_that_were_not_found_are_counted(
 def test_messages_name_keypoints_as_the_file_does(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Left out are keypoints before the wrong one; without names it is row 9 of the file."""
+    """Keypoints before the wrong one are left out; without names, it is row 9 of the file."""
     pixels = POINTS_2D.copy()
     pixels[[2, 5]] = 0
     pixels[9] += 80

@@ -13,7 +13,7 @@ import tyro
 from PIL import Image
 from support.refusals import refusal_line
 
-from cadalign.cli.doctor import Doctor, compiled_cache
+from cadalign.cli.doctor import Doctor, describe_cache
 from cadalign.cli.render import Render
 from cadalign.compile.folder import kernel_folder
 from cadalign.errors import DataError, InputError, RenderError
@@ -71,7 +71,7 @@ def test_keypoints_are_drawn_from_their_file(model, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        (["--resolution", "0x0"], InputError, "'0x0' is no resolution"),
+        (["--resolution", "0x0"], InputError, "'0x0' is not a resolution"),
         (["--resolution", "640"], InputError, "give WIDTHxHEIGHT"),
         (["--resolution", "20000x20000"], RenderError, "the limits are 16384 px a side"),
         (["--view", "sideways"], InputError, "is not a view"),
@@ -99,32 +99,32 @@ def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
 def test_doctor_shows_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
     good, bad = Probe("raycast", True, "processor"), Probe("pyrender", False, "no OpenGL")
     for probed, code in (([bad, good], 0), ([Probe("raycast", False, "embreex is gone")], 1)):
-        monkeypatch.setattr("cadalign.cli.doctor.probed_renderers", lambda found=probed: found)
+        monkeypatch.setattr("cadalign.cli.doctor.probe_renderers", lambda found=probed: found)
         monkeypatch.setattr("cadalign.render.probe.best_renderer", lambda: "raycast")
         assert Doctor().run() == code
         text = capsys.readouterr().out
-    assert "raycast   fails: embreex is gone\n--renderer auto takes: raycast\n" in text
+    assert "raycast   fails: embreex is gone\nDefault renderer: raycast\n" in text
     assert f"To enable raycast: {REMEDIES['raycast']}\n" in text
     assert "Compiled solvers: " in text
 
 
 def test_the_state_of_the_cache_is_shown(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert compiled_cache() == f"none yet; they will be kept in {kernel_folder()}"
+    assert describe_cache() == f"none yet; they will be kept in {kernel_folder()}"
     assert kernel_folder().parent == tmp_path / "cache"
     kernel_folder().mkdir(parents=True)
     (kernel_folder() / "one.nbc").write_text("")
-    assert compiled_cache().startswith("1 functions kept")
+    assert describe_cache().startswith("1 functions kept")
     if hasattr(os, "getuid") and os.getuid():
         (tmp_path / "shut").mkdir(mode=0o500)
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shut" / "cache"))
-        assert "set NUMBA_CACHE_DIR" in compiled_cache()
+        assert "set NUMBA_CACHE_DIR" in describe_cache()
 
 
 def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("cadalign.cli.doctor.can_write", lambda folder: False)
-    fix = "set NUMBA_CACHE_DIR to a folder that can be"
+    fix = "set NUMBA_CACHE_DIR to a writable folder"
     line = refusal_line(capsys, "doctor", "--compile")
     assert line == f"--compile: {kernel_folder()} cannot be written to; {fix}"
 

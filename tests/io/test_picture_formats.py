@@ -68,7 +68,7 @@ READERS = [
     read_grey,
     FocalPrior.from_exif,
     lambda path: PhotoObject(object_id="a", category="a", mask_path=path).read_mask(),
-    lambda path: PhotoFile(path, 4, 4).encoded(),
+    lambda path: PhotoFile(path, 4, 4).encode(),
 ]
 
 

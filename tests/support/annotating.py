@@ -20,7 +20,7 @@ from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
 from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.photos import MarkedMask
+from cadalign.annotate.photos import ObjectMask
 from cadalign.annotate.server import Access, listen, make_app, make_server
 from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main
@@ -144,7 +144,7 @@ def draw_mask(session: Session, mask: np.ndarray) -> None:
     """Have a mask drawn on the first photo."""
     with session.lock:
         state = session.annotation(0)
-        state.record(replace(state.marks, mask=MarkedMask.of(mask)))
+        state.record(replace(state.marks, mask=ObjectMask.from_pixels(mask)))
         session.save(state)
 
 

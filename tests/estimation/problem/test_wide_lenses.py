@@ -342,6 +342,6 @@ def test_the_annotator_takes_no_wide_lens(tmp_path) -> None:
     fix = "undistort the photo, or crop it to a pinhole's view"
     Image.new("RGB", (1000, 1000)).save(tmp_path / "photo.png")
     with pytest.raises(
-        DataError, match=rf"photo.png.*: the annotator takes no fisheye lens; {fix}$"
+        DataError, match=rf"photo.png.*: the annotator does not support fisheye lenses; {fix}$"
     ):
         camera_of(PhotoFile.open(tmp_path / "photo.png"), NARROWER)

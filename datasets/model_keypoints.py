@@ -125,8 +125,8 @@ class ModelKeypoints:
         Parameters
         ----------
         path : str or path-like
-            A file as described in docs/formats/files.md, or a mesh with such a file beside
-            it.
+            A file as described in docs/formats/files.md, or a mesh with such a file beside it,
+            which is the ``model`` if the file names no other.
 
         Raises
         ------
@@ -134,17 +134,16 @@ class ModelKeypoints:
             If the file is missing, is not JSON, has another format or version, or a field is
             missing, unknown or invalid; the message names file and field.
         """
-        path = as_path(path)
-        if path.suffix.lower() in MESH_ENDINGS:
-            beside = path.with_suffix(SUFFIX)
-            path = beside if os.path.isfile(beside) else path
+        path, mesh = as_path(path), None
+        if path.suffix.lower() in MESH_ENDINGS and os.path.isfile(path.with_suffix(SUFFIX)):
+            path, mesh = path.with_suffix(SUFFIX), path
         data = read_json(path, MODEL_KEYPOINTS)
         if not isinstance(data, dict):
             what = "a list, not an object of model keypoints"
             raise DataError(what, where=str(path), fix=_WANTED)
         with in_file(path):
             read: _File = convert(data, _File)
-            model = None if read.model is None else path_from(read.model, path.parent)
+            model = mesh if read.model is None else path_from(read.model, path.parent)
             keypoints = (ModelKeypoint(e.name, e.xyz, e.semantic_id) for e in read.keypoints)
             return cls(tuple(keypoints), model)
 

@@ -24,7 +24,7 @@ _OBJECTS_BETWEEN_COLLECTIONS = 50_000
 COMMANDS = {  # module and class, and the first sentence of the help
     "demo": (
         "evaluate.Demo",
-        "Align stretched models to pictures of the originals, and show the result.",
+        "Align stretched models to pictures of the originals and show the results.",
     ),
     "fit": ("fit.Fit", "Align a model to an observation, and draw the result."),
     "observe": ("observe.Observe", "Match a detector's keypoints to a model's keypoints."),

@@ -314,8 +314,8 @@ _TEXTS = {
     "of {best.result.camera.fx:.4g} px",
     "outlier": "the residuals are {given.ratio:.2g} times as large as sigma explains: {wrong} "
     "{do} not fit the others (with the distance to the predicted position)",
-    "misfit": "the residuals are {given.ratio:.2g} times as large as sigma and the spread of "
-    "shapes explain: keypoints, sigma, the camera or the model are wrong; the worst are {wrong}",
+    "misfit": "the residuals are {given.ratio:.2g} times as large as sigma{spread} "
+    "can explain: keypoints, sigma, the camera or the model are wrong; the worst are {wrong}",
 }
 
 
@@ -331,6 +331,7 @@ def warning_of(
         wrong, view, keypoints = _wrong_keypoints(case, best, all_agree=rule.kind == "misfit")
     words = {"named": clauses, "compared": _comparison(best, given), "scale": scale, "wrong": wrong}
     words |= {"posture": posture, "do": "does" if len(keypoints) == 1 else "do"}
+    words["spread"] = "" if case.is_exact else " and the spread of shapes"
     text = _TEXTS[rule.kind].format(best=best, given=given, **words)
     return EstimateWarning(rule.kind, text, 0 if rule.kind == "camera" else view, keypoints)
 

@@ -269,6 +269,8 @@ class EvidenceSummary:
         return self.kind if self.view is None else f"views[{self.view}].{field}"
 
     def __str__(self) -> str:
+        if self.share == 0:
+            return f"{self.name}: left out"
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.name}: rms {self.rms:.3g}{unit}, {self.rms_sigmas:.2g} sigma"
 

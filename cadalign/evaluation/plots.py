@@ -170,8 +170,9 @@ def cumulative_plot(runs: Sequence[Run], metric: Metric, places: FloatArray, *, 
         count = len(errors) + int((rows["status"] == FAILED).sum())
         return np.asarray(is_within(errors, places[:, None]).sum(axis=1) / max(count, 1))
 
+    shown = (metric.factor * places).tolist()
     traces = [
-        Trace.of(index, method, places.tolist(), shares(rows).tolist(), metrics.COVERED)
+        Trace.of(index, method, shown, shares(rows).tolist(), metrics.COVERED)
         for index, run in enumerate(runs)
         for method in run.methods
         for rows in [select_rows(run.cells, run.cells["method"] == method)]

@@ -118,3 +118,14 @@ def test_files_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> Non
     one = ModelKeypoints((ModelKeypoint("a", (0.0, 0.0, 0.0)),))
     with pytest.raises(DataError, match=r"no/such\.json: cannot be written \(No such file"):
         one.save(tmp_path / "no" / "such.json")
+
+
+def test_a_mesh_is_the_model_of_keypoints_beside_it(tmp_path: Path) -> None:
+    names_no_mesh = {
+        "format": "cadalign model keypoints",
+        "version": 1,
+        "keypoints": [{"name": "tip", "xyz": [0, 0, 1]}],
+    }
+    (tmp_path / "chair.keypoints.json").write_text(json.dumps(names_no_mesh))
+    assert ModelKeypoints.load(tmp_path / "chair.obj").model == tmp_path / "chair.obj"
+    assert ModelKeypoints.load(tmp_path / "chair.keypoints.json").model is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -185,7 +186,11 @@ def test_the_how_to_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize(
     ("metric", "places", "shares"),
-    [(ROTATION, [0.5, 1.0, 9.0], [0, 50, 75]), (BOX_IOU, [0.5, 1.0, 2.5], [75, 75, 25])],
+    [
+        (ROTATION, [0.5, 1.0, 9.0], [0, 50, 75]),
+        (BOX_IOU, [0.5, 1.0, 2.5], [75, 75, 25]),
+        (replace(ROTATION, key="s_y", factor=100.0), [0.5, 1.0, 9.0], [0, 50, 75]),
+    ],
 )
 def test_curves_count_small_errors_and_large_overlaps(
     metric: Metric, places: list[float], shares: list[float]
@@ -198,3 +203,4 @@ def test_curves_count_small_errors_and_large_overlaps(
     run: Any = SimpleNamespace(methods=("mine",), cells=cells)
     (trace,) = cumulative_plot([run], metric, np.array(places), title="").traces
     assert list(trace.y) == shares
+    assert trace.x == [metric.factor * place for place in places]

@@ -335,7 +335,7 @@ def test_an_unfinished_run_shows_what_there_is(tmp_path: Path) -> None:
     found = report(tmp_path, unfinished)
     (state,) = found["runs"]
     assert (state["state"], state["done"], state["total"]) == ("unfinished", 64 + 22, 150)
-    assert "unfinished, 86 of 150 tasks are done" in found["summary"]
+    assert "unfinished: 86 of 150 tasks are done" in found["summary"]
     strings, instances, _ = columns(found)
     names = [strings[place] for place in instances["model"]]
     assert names == [f"m{k:03d}" for k in (*range(64), *range(128, 150))]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cadalign.estimation.uncertainty.residuals import loss_weights
-from cadalign.retrieval.ranking import bent
+from cadalign.retrieval.ranking import apply_loss
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 
 
@@ -14,5 +14,5 @@ from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 def test_the_weights_of_a_loss_are_its_derivatives(loss: int) -> None:
     squares, bend, step = np.array([0.5, 2.0, 3.0, 10.0, 40.0]), 1.5, 1e-5
     above, below = squares + step, squares - step
-    by_square = (bent(above, loss, bend) - bent(below, loss, bend)) / (2 * step)
+    by_square = (apply_loss(above, loss, bend) - apply_loss(below, loss, bend)) / (2 * step)
     np.testing.assert_allclose(loss_weights(squares, loss, bend), by_square, rtol=1e-6)

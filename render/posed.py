@@ -127,7 +127,7 @@ class PosedScene:
     def blocked(
         self, points_cam: FloatArray, directions: FloatArray, *, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Whether each ray hits the object within a distance, (n,) bool.
+        """Mark rays that hit the object within a distance, (n,) bool.
 
         Starts ``points_cam`` and unit ``directions`` (n, 3) are in the camera frame, ``reach`` in
         model units.
@@ -248,7 +248,7 @@ _STEPS = 24
 
 
 def within_lens_field(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.bool_]:
-    """Whether points (n, 3) are in front of the camera with a valid lens model, (n,) bool.
+    """Mark points (n, 3) that are in front of the camera with a valid lens model, (n,) bool.
 
     A distortion polynomial decreases beyond some radius, and maps distant directions back into the
     image. A point is valid if the distorted radius grows all the way from the centre to it.

@@ -192,7 +192,7 @@ def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None =
 
 
 def _find_contrast(color: ByteImage) -> BoolArray:
-    """Whether each pixel visibly differs from one of its 8 neighbours, (h, w) bool."""
+    """Mark pixels that visibly differ from one of its 8 neighbours, (h, w) bool."""
     around = np.ones((3, 3), dtype=np.uint8)
     span = cv2.subtract(cv2.dilate(color, around), cv2.erode(color, around))
     return np.asarray(span.reshape(color.shape).max(axis=2) > _VISIBLE_STEP)

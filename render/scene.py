@@ -94,7 +94,7 @@ class Scene:
 
     @cached_property
     def coincident_faces(self) -> tuple[IntArray, IntArray]:
-        """Which of coincident triangles to show, from either side; see `coincident_faces`."""
+        """The coincident triangles to show, from either side; see `coincident_faces`."""
         return coincident_faces(self.mesh.vertices, self.mesh.faces)
 
     @cached_property

@@ -40,7 +40,7 @@ class SurfaceColors:
 
     @property
     def opaque(self) -> bool:
-        """Whether the whole surface is opaque."""
+        """True if the whole surface is opaque."""
         color = self._face_color if self._corner_color is None else self._corner_color
         return bool((color[..., 3] >= 1).all()) and all(
             bool((texture[..., 3] >= 1).all()) for texture in self._textures.values()

@@ -361,7 +361,7 @@ def visible_keypoints(
 
 
 def seen_in_image(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.bool_]:
-    """Whether points (k, 3) in the camera frame are visible inside its image, (k,) bool."""
+    """Mark points (k, 3) in the camera frame that are visible inside its image, (k,) bool."""
     seen = within_lens_field(camera, points_cam)
     seen[seen] = camera.contains(camera.pixels_of_rays(points_cam[seen]))
     return seen

@@ -198,7 +198,7 @@ class ClickableModel:
 
 
 @dataclass(eq=False)
-class AnnotatedModel:
+class MarkedModel:
     """A model that can be clicked on, its keypoints, and the file they are written to."""
 
     path: Path
@@ -222,7 +222,7 @@ class AnnotatedModel:
 
 def open_model(
     path: Path, folder: Path, *, keypoints: Path | None = None, shape: ObjectShape
-) -> AnnotatedModel:
+) -> MarkedModel:
     """Open a model, and read its keypoints.
 
     ``keypoints`` is its keypoint file, by default beside it; changes are written into ``folder``.
@@ -240,4 +240,4 @@ def open_model(
             if source == own:
                 refuse_other_model(read.model, path, where=own)
             registry.merge(read.keypoints)
-    return AnnotatedModel(path, cad, registry, own, content)
+    return MarkedModel(path, cad, registry, own, content)

@@ -19,7 +19,7 @@ import numpy as np
 
 from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
 from cadalign.annotate.marks import KeypointRegistry, Marks, ObjectShape, Pair, positions_of
-from cadalign.annotate.model import AnnotatedModel
+from cadalign.annotate.model import MarkedModel
 from cadalign.annotate.photos import ObjectMask, PhotoFile, camera_of
 from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
@@ -65,7 +65,7 @@ class ObservationFile:
 
     path: Path
     photo: PhotoFile
-    model: AnnotatedModel
+    model: MarkedModel
     shape: ObjectShape
     stored: Observation = field(init=False)
     """Content of the file when it was opened; the marks replace parts of it."""

@@ -18,7 +18,7 @@ from cadalign.annotate.files import (
     refuse_collisions,
 )
 from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel, positions_of
-from cadalign.annotate.model import AnnotatedModel, Wireframe, open_model
+from cadalign.annotate.model import MarkedModel, Wireframe, open_model
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS, ObservationFile
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
 from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors, warm_up
@@ -91,7 +91,7 @@ class Annotation:
         return self.file.photo
 
     @property
-    def model(self) -> AnnotatedModel:
+    def model(self) -> MarkedModel:
         """The model of the session."""
         return self.file.model
 
@@ -159,7 +159,7 @@ class Annotation:
 class Session:
     """All state of an annotator; safe to use from several threads."""
 
-    model: AnnotatedModel
+    model: MarkedModel
     shape: ObjectShape = field(default_factory=ObjectShape)
     photos: list[Annotation] = field(default_factory=list)
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant

@@ -44,7 +44,7 @@ def _regions(seed: int, count: int) -> Iterator[Row]:
 
 
 def _coverage(stream: tuple[int, int, int], *, kind: str) -> Row:
-    """Whether the regions of rotation, translation and lengths hold the truth, for one estimate."""
+    """Tell if the regions of rotation, translation and lengths hold the truth, for one estimate."""
     rng, points = np.random.default_rng(stream), stream[1]
     model = rng.uniform(-0.5, 0.5, (points, 3))
     scale = np.array([1.0, *np.exp(rng.normal(0, _STRETCH_SIGMA, 2))])
@@ -185,7 +185,7 @@ def _mistakes(
 
 
 def _outcome(case: _Case) -> Row:
-    """Whether an estimate has a warning, and whether it is silently wrong."""
+    """Tell if an estimate has a warning, and if it is silently wrong."""
     view = View(case.camera, case.points_2d, ids=case.ids, sigma=_WARNED_PX)
     result = cadalign.align(case.model, view, **case.options)
     poses = [result.alignment, *(each.alignment for each in result.alternatives)]

@@ -41,7 +41,7 @@ COMMANDS = {  # module and class, and the first sentence of the help
     "evaluate": ("evaluate.Evaluate", "Evaluate methods on a dataset."),
     "simulate": (
         "evaluate.Simulate",
-        "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
+        "Repeat the AEPnP paper's simulation.",
     ),
     "report": ("evaluate.ReportCommand", "Write a page with the results of one or more runs."),
     "export": ("fit.Export", "Write a fit for another tool."),

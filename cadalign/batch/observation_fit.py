@@ -19,7 +19,6 @@ from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacO
 from cadalign.estimation.result_parts import quickly
 from cadalign.io.documents import convert, in_file, within
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.io.observation import FitFields, Observation, ObservationChanges
 
@@ -215,6 +214,8 @@ class ObservationFit:
             if seen.symmetry is not None:
                 what, place = "has no effect together with a learned shape", f"{where}: symmetry"
                 raise InputError(what, where=place, fix="leave out one of the two")
+            from cadalign.shapes.model import open_shape
+
             return open_shape(self.shape or seen.shape)  # errors name the option's path
         mesh = None if seen.model is None else mesh_at(seen.model)
         sigma = seen.fit_options.get("shape_sigma")
@@ -355,14 +356,6 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
         tuple(numbers.setdefault(tuple(xyz), len(numbers)) for xyz in image.points_3d.tolist())
         for image in images
     )
-
-
-@once_per_file(4)
-def open_shape(path: Path) -> ShapeModel:
-    """Open a learned shape; a run opens its file once."""
-    from cadalign.shapes.model import ShapeModel
-
-    return ShapeModel.open(path)
 
 
 def _prior_for(seen: Observation, note: Note) -> PriorOption:

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 from cadalign.arrays import worker_count
-from cadalign.batch.observation_fit import ObservationFit, open_shape
+from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import (
     COLUMNS,
     RECORD_COLUMNS,
@@ -84,6 +84,8 @@ class FitRunOptions(ExperimentOptions):
         self.estimate.check()
         if self.estimate.shape is None:
             return None
+        from cadalign.shapes.model import open_shape  # takes time to import
+
         shape = open_shape(self.estimate.shape)
         named = isinstance(shape.ids[0], str)
         pairs = zip(shape.ids, shape.components[0].mean.tolist(), strict=False)

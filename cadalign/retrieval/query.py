@@ -36,7 +36,11 @@ class ObservationRetrieval:
 
     def opened(self) -> tuple[Library, ShapeModel | None]:
         """Read the library and the shape model, cached; raises DataError if unreadable."""
-        return _library(self.library), None if self.shape is None else _shape(self.shape)
+        if self.shape is None:
+            return _library(self.library), None
+        from cadalign.shapes.model import open_shape  # not needed for the commands' help
+
+        return _library(self.library), open_shape(self.shape)
 
     def read(
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
@@ -86,10 +90,3 @@ def _library(path: Path) -> Library:
     from cadalign.retrieval.library import Library  # not needed for the commands' help
 
     return Library.open(path)
-
-
-@once_per_file(4)
-def _shape(path: Path) -> ShapeModel:
-    from cadalign.shapes.model import ShapeModel  # not needed for the commands' help
-
-    return ShapeModel.open(path)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
+from cadalign.io.files import once_per_file
 from cadalign.shapes.basis import component_of_basis
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.outputs import read_shape, write_shape
@@ -335,3 +336,7 @@ class ShapeModel:
         expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
         distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
         return int(np.argmin(distances))
+
+
+open_shape = once_per_file(4)(ShapeModel.open)
+"""`ShapeModel.open`, cached: a run opens its file once."""

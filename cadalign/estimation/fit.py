@@ -30,7 +30,7 @@ from cadalign.estimation.result_parts import EstimateWarning, FittedKeypoints
 from cadalign.estimation.results import COLUMNS, Entry, Results
 from cadalign.estimation.solve import are_solved_at_once, fit_keypoints, solve
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry import Symmetry, check_symmetry
 from cadalign.io.focal import PriorOption
 from cadalign.solvers.constants import POSE_SIZE
 
@@ -158,8 +158,6 @@ def check_search(ransac: object, scores: object, symmetry: Symmetry | None) -> N
         fix = "give ransac=RansacOptions(...), or the keypoints' sigma instead"
         raise InputError("given without ransac", where="scores", fix=fix)
     if symmetry is not None:
-        from cadalign.estimation.symmetry import check_symmetry  # most models have none
-
         check_symmetry(symmetry)
 
 

@@ -12,10 +12,9 @@ import numpy.typing as npt
 from cadalign.arrays import as_floats, as_points, as_positive, read_only
 from cadalign.errors import InputError, require_kind
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
-from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh, check_near
-from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry import Symmetry, check_symmetry
 from cadalign.shapes.parts import check_axis, check_ids
 
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import require_kind
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angles_between, by_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Equal, Symmetry
@@ -22,11 +21,6 @@ from cadalign.geometry.symmetry import Equal, Symmetry
 SAME_SQUARES = 9.0
 """Largest squared distance [sigma^2] between rotations of equal estimates."""
 _SAME_DEG = 0.01  # between equal rotations, without or with tiny deviations
-
-
-def check_symmetry(symmetry: Symmetry) -> None:
-    """Raise InputError unless it is a Symmetry."""
-    require_kind(symmetry, Symmetry, "symmetry", fix="see cadalign.Symmetry.from_dict")
 
 
 def held_axes(stretched: str) -> tuple[bool, bool, bool]:

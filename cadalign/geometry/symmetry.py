@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, is_whole, read_only
-from cadalign.errors import InputError, quote
+from cadalign.errors import InputError, quote, require_kind
 from cadalign.geometry.alignment import OPENGL_AXES, Alignment
 from cadalign.geometry.rotations import angles_between, nearest_rotation, rotation_from_vector
 
@@ -253,6 +253,11 @@ class Symmetry:
             return [(rotation, self.axes) for rotation in self.rotations]
         turns = [rotation_from_vector(angle * self.axes[0]) for angle in _ANGLES]
         return [(turn @ each, _NO_AXES) for each, turn in product(self.rotations, turns)]
+
+
+def check_symmetry(symmetry: object) -> None:
+    """Raise InputError unless it is a `Symmetry`."""
+    require_kind(symmetry, Symmetry, "symmetry", fix="see cadalign.Symmetry.from_dict")
 
 
 def _direction(axis: FloatArray, where: str) -> FloatArray:

@@ -19,7 +19,7 @@
         "rows": {"instance", "method", "status", "reason", each metric's key}
       },
       "plots": [{"id", "title", "x": {"label", "unit", "log"}, "y",
-                 "traces": [{"run", "method", "x", "y", "low", "high"}], "note"}],
+                 "traces": [{"run", "method", "x", "y"}], "note"}],
       "pictures": {key: URL}, "thumbs": {key: URL},
       "exhibits": {key: exhibit}, "meshes": {key: mesh}
     }

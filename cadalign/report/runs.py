@@ -24,10 +24,7 @@ _LABELS = {
     "min_visible": "minimum visible keypoints",
     "max_models": "models per category, at most",
     "render": "pictures",
-    "max_reproj_error": "inliers within",
-    "max_iterations": "samples, at most",
 }
-_PIXELS = ("noise_px", "noises_px", "max_reproj_error")
 
 
 def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
@@ -150,7 +147,7 @@ def settings_of(run: Run) -> list[tuple[str, str]]:
     for name in names:
         if config.get(name) is not None and not isinstance(config[name], dict):
             label = _LABELS.get(name, name.removesuffix("_px").replace("_", " "))
-            found.append((label, _text(config[name]) + (" px" if name in _PIXELS else "")))
+            found.append((label, _text(config[name]) + (" px" if name == "noise_px" else "")))
     version = run.config.get("versions", {}).get("cadalign")
     return [*found, ("cadalign", str(version))] if version else found
 

@@ -72,16 +72,13 @@ const plain = (text) =>
     .replaceAll(">", "&gt;")
     .replaceAll("%{", "%\u200b{");
 
-/** Traces of lines, each after a band of its quartiles, if known. */
+/** Traces of lines. */
 function tracesOf(report, lines) {
-  return lines.flatMap(({ run, method: key, x, y, low, high }) => {
+  const several = report.runs.length > 1;
+  return lines.map(({ run, method: key, x, y }) => {
     const method = report.method.get(key);
     const color = colorOf(method);
-    const several = report.runs.length > 1;
-    const edge = { x, mode: "lines", hoverinfo: "skip", line: { width: 0, color } };
-    const fill = { fill: "tonexty", fillcolor: `${color}1f` };
-    const band = low && high ? [{ ...edge, y: low }, { ...edge, y: high, ...fill }] : [];
-    const line = {
+    return {
       x,
       y,
       name: plain(several ? `${key}, ${report.runs[run].name}` : key),
@@ -90,7 +87,6 @@ function tracesOf(report, lines) {
       marker: { color, size: 6, symbol: SYMBOLS[placeOf(report, key)][0], maxdisplayed: MARKERS },
       hovertemplate: "%{y:.3~g}",
     };
-    return [...band, line];
   });
 }
 
@@ -104,7 +100,7 @@ function decades(values) {
 /** Layout of a plot; the page has the title and the legend. */
 function layoutOf({ x, y }, lines) {
   const [ink, soft, line, card] = ["ink", "soft", "line", "card"].map(themeColor);
-  const values = (...names) => lines.flatMap((one) => names.flatMap((name) => one[name] ?? []));
+  const values = (name) => lines.flatMap((one) => one[name] ?? []);
   const axis = (metric, all) => ({
     title: { text: plain(named(metric)), standoff: 8, font: { size: 13 } },
     type: metric.log ? "log" : "linear",
@@ -121,7 +117,7 @@ function layoutOf({ x, y }, lines) {
     plot_bgcolor: "rgba(0,0,0,0)",
     margin: { l: 52, r: 12, t: 10, b: 44 },
     xaxis: axis(x, values("x")),
-    yaxis: axis(y, values("y", "low", "high")),
+    yaxis: axis(y, values("y")),
     showlegend: false,
     hovermode: "x unified",
     hoverlabel: { bgcolor: card, bordercolor: line, font: { color: ink, size: 12 } },

@@ -297,7 +297,7 @@ class DetectorOptions:
     """Model and photos for a detector's keypoints, and the selection of keypoints."""
 
     model: Path | None = None
-    """The model's NAME.keypoints.json, or the mesh that it lies beside, for a detector's file.
+    """For a detector's file: the model's NAME.keypoints.json, or the mesh beside that file.
     Keypoints are paired by name, otherwise by semantic id, otherwise by order. With --shape, the
     shape's keypoints by default."""
     images: Path | None = None

@@ -53,10 +53,10 @@ class CorrespondenceOptions(FunctionOptions):
     """Evaluate methods on real correspondences with outliers.
 
     For every image, share of outliers and draw, the scene is stretched by random factors from 0.5
-    to 2 along y and z. The share of the image points is moved to random pixels. All methods get the
-    same input. The run's folder gets results.parquet with a row per input and method, summary.csv,
-    figures and report.html. An interrupted run continues when the same command is started again.
-    Measure times with --workers 1.
+    to 2 along y and z. That share of the image points is moved to random pixels. All methods get
+    the same input. The run's folder gets results.parquet with a row per input and method,
+    summary.csv, figures and report.html. An interrupted run continues when the same command is
+    started again. Measure times with --workers 1.
     """
 
     experiment = "correspondences"

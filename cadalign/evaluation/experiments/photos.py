@@ -72,9 +72,9 @@ class PhotosOptions(FunctionOptions):
     """Categories to use; all by default."""
     methods: tuple[str, ...] = BASES
     """Base methods: epnp; rigid; stretched; prior (stretched, with a prior on the scales); similar
-    (like prior, and the object's keypoints differ from the model's by 4 % of its diagonal); truth.
-    rigid, stretched, prior and similar take further evidence: mask, gravity, image (the photo
-    itself), as in rigid+mask or similar+mask+gravity."""
+    (like prior, and the object's keypoints differ from the model's by 4 % of its diagonal); truth
+    (the annotated pose). rigid, stretched, prior and similar take further evidence: mask, gravity,
+    image (the photo itself), as in rigid+mask or similar+mask+gravity."""
     max_photos: int | None = None
     """Use only the first photos, this many; all by default."""
     pictures: int = 100

@@ -140,9 +140,16 @@ class PublicNames(Directive):
         return node.children
 
 
+def _keep_colon(*event: Any) -> None:
+    """Put a comment before an attribute's text, or napoleon takes it up to a colon for a type."""
+    if event[1] in ("attribute", "property"):
+        event[-1][:0] = ["..", ""]
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("command-help", CommandHelp)
     app.add_directive("json-schema", JsonSchema)
     app.add_directive("public-names", PublicNames)
     app.connect("build-finished", write_schemas)
+    app.connect("autodoc-process-docstring", _keep_colon, priority=400)  # before napoleon
     return {"parallel_read_safe": True, "parallel_write_safe": True}

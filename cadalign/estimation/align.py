@@ -273,7 +273,7 @@ def align_batch(
     Parameters
     ----------
     model, loss, loss_scale, ransac, focal, focal_prior
-        As for `align`; every object has focal lengths of its own.
+        As for `align`. Estimated focal lengths differ between objects.
     objects : sequence of View or of sequences of View
         The views of every object.
     size, init

@@ -95,8 +95,8 @@ def fit(
         covers usual lenses, see `FocalPrior.of_usual_lenses`. None for no prior.
     ransac : RansacOptions, optional
         Robust search, for keypoints with outliers: find the alignment with the most inliers, then
-        fit to these. ``result.inliers`` marks them. With an unknown focal length the options have
-        the meaning stated for `cadalign.align`.
+        fit to these. ``result.inliers`` marks them. For an unknown focal length
+        see `cadalign.align`.
     scores : (n,) float, optional
         Confidences of the keypoints, for ``ransac``: the weights of every second sample.
     symmetry : Symmetry, optional
@@ -282,7 +282,7 @@ def fit_batch(
     sigma : float, None, or sequence of B
         As for `fit`, for all problems; a sequence gives each problem its own.
     method, loss, loss_scale, stretch, stretch_sigma, focal, focal_prior
-        As for `fit`; every problem has a focal length of its own.
+        As for `fit`. Estimated focal lengths differ between problems.
     ransac
         As for `fit`.
     scores : sequence of B (n_b,) float, optional

@@ -94,7 +94,7 @@ class Result:
     rig_from_model : Alignment, optional
         The alignment in the rig's frame; None for views without ``cam_from_rig``.
     own_bounds, own_stretch : optional
-        ``bounds`` and ``stretch`` if they differ from the keypoints' bounds and the scale.
+        ``bounds`` and ``stretch``, unless they are the keypoints' bounds and the scale.
     """
 
     views: tuple[ViewResult, ...]
@@ -215,7 +215,7 @@ class Result:
         """Names of quantities with a standard deviation beyond 25 %, or 30 degrees.
 
         Any of "s_x", "s_y", "s_z", "distance" (to the model's origin), "focal length", "rotation".
-        None of them is a warning.
+        They give no warnings.
         """
         return () if self.covariance is None else uncertain_of(self.alignment, self.covariance)
 
@@ -286,7 +286,7 @@ class Result:
             Between 0 and 1.
         dimension : int
             Dimension of the region: 1 for an interval, 3 for the ellipsoid of a rotation,
-            translation or keypoint, along the principal axes of its covariance. Neither applies to
+            translation or keypoint, along the principal axes of its covariance. Not for
             ``std.rotation_deg``, a total over three axes.
 
         Raises

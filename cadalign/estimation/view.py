@@ -55,7 +55,7 @@ class View:
         Ids or names of these keypoints in the model; default: all of the model's, in its order.
     sigma : float, (n,) float, (n, 2, 2) float, or None
         Standard deviation of all keypoints or of each [px], or covariance of each [px^2]. None
-        estimates one value for all views with None, under a weak prior centred at 2 px.
+        estimates it, jointly for all such views, with a weak prior centred at 2 px.
     scores : (n,) float, optional
         Confidences of the keypoints, for a robust search.
     depth : (n,) or (h, w) float, or path, optional
@@ -92,7 +92,7 @@ class View:
         The RGB photo as evidence: the model's outline is searched for in it, near the estimate from
         all other evidence. The model needs a mesh. Ignored if the view has a mask.
     photo : path, optional
-        The photo, not used as evidence. If it has the camera's size, no warning suggests another.
+        The photo, for checks of the image size only; it is no evidence.
     number : int
         Index of the view in errors, warnings and evidence; set by `align`.
 

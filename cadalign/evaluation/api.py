@@ -40,9 +40,8 @@ def evaluate(
         The dataset: a folder in KeypointNet's layout (``keypointnet``, ``retrieval``,
         ``unseen``, ``demo``), a data set of photos (``photos``), or a COLMAP model or a
         blind-PnP data set (``correspondences``). ``simulate`` has none.
-    experiment : {"keypointnet", "correspondences", "retrieval", "unseen", "photos",
-        "simulate", "demo"}
-        Name of the experiment.
+    experiment : str
+        `keypointnet`, `correspondences`, `retrieval`, `unseen`, `photos`, `simulate` or `demo`.
     workers : int, optional
         Number of worker processes; -1 for one per core (the default), 0 for this process alone.
     dask : str, optional

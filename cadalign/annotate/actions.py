@@ -6,17 +6,20 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
 
+from cadalign.annotate.marks import ObjectShape, Pair
 from cadalign.annotate.photos import ObjectMask, segment_box
 from cadalign.annotate.session import Annotation, Session
-from cadalign.errors import InputError, quote
+from cadalign.errors import InputError, quote, unknown
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Finite, ForeignDocument, Index, Point2, Point3, Text, convert
 from cadalign.io.images import read_photo
+from cadalign.shapes.pretrained import CATEGORIES
 
 _FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
 
@@ -77,9 +80,48 @@ def place_keypoint(
 ) -> ActionOutcome:
     """Place a model half at a keypoint of the registry, preferably of the given pair."""
     state.model.registry[keypoint]  # raises InputError for an unknown keypoint
+    pending = [each.number for each in state.marks.pairs if each.uv is None]
+    if state.model.is_skeleton and pending:  # another keypoint is chosen instead
+        state.record(state.marks.exchange_keypoint(pending[0], keypoint))
+        return ActionOutcome(pending[0])
     marks, number = state.marks.place_keypoint(keypoint, pair)
     state.record(marks)
     return ActionOutcome(number)
+
+
+def take(state: Annotation, *, keypoint: Index, uv: Point2) -> ActionOutcome:
+    """Place a new pair: a keypoint that is proposed or estimated, and its place in the photo."""
+    state.model.registry[keypoint]  # raises InputError for an unknown keypoint
+    state.require_inside(uv)
+    number = state.marks.next_number
+    state.record(state.marks.append(Pair(number, uv)).exchange_keypoint(number, keypoint))
+    return ActionOutcome(number)
+
+
+def skip(state: Annotation) -> ActionOutcome | None:
+    """Propose another keypoint; if all were skipped, propose them anew."""
+    proposed = state.proposed(state.alignment())
+    if proposed is None:
+        state.skipped.clear()
+    else:
+        state.skipped.add(proposed)
+    return None
+
+
+def category(state: Annotation, *, name: Text) -> ActionOutcome:
+    """Exchange the category of the object in this photo; pairs of equal names stay."""
+    if not state.can_exchange:
+        raise InputError("only categories that come with cadalign can be exchanged", where="name")
+    if name not in CATEGORIES:
+        raise unknown("category", name, CATEGORIES, where="name")
+    before = len(state.marks.complete_pairs)
+    state.exchange_shape(ObjectShape.open(Path(name)))
+    kept = len(state.marks.complete_pairs)
+    lost = before - kept
+    text = f"The object in this photo is a {name} now. {kept} of {before} pairs stay."
+    if lost:
+        text += " Choose keypoints for the others on the right."
+    return ActionOutcome(message=f"{text} This cannot be undone.")
 
 
 def pick(
@@ -95,7 +137,7 @@ def pick(
     if near is None:
         point = model.pick(model.from_display(origin), direction)
         if point is None:
-            return ActionOutcome(message="That click missed the model.")
+            return ActionOutcome(message=model.missed)
         near = registry.find(point.xyz)
         near = registry.add(point) if near is None else near
     return place_keypoint(state, keypoint=near, pair=pair)
@@ -207,7 +249,7 @@ ACTIONS: dict[str, Callable[..., ActionOutcome | None]] = {
     function.__name__: function
     for function in (
         *(place_uv, place_keypoint, pick, move, release, delete, rename, identify),
-        *(focal, mask_cut, mask_clear, use_photo, undo, redo),
+        *(take, skip, category, focal, mask_cut, mask_clear, use_photo, undo, redo),
     )
 }
 """Actions by the name that the page sends as ``do``."""

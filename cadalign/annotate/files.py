@@ -32,8 +32,9 @@ class SessionOptions:
 
     image: Path
     """A photo, or a folder of photos."""
-    model: Path
-    """OBJ, PLY, GLB, glTF, STL or OFF file."""
+    model: Path | None = None
+    """OBJ, PLY, GLB, glTF, STL or OFF file. Without a model, the
+    keypoints of the shape are marked."""
     observation: Path | None = None
     """Observation file of a single photo, by default beside the photo. An existing file is
     continued."""
@@ -126,13 +127,16 @@ def refuse_collisions(written: Iterable[Path], read: Iterable[Path]) -> None:
         seen.add(_key(path))
 
 
-def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
+def refuse_other_model(named: Path | None, model: Path | None, *, where: Path) -> None:
     """Raise DataError if a file names another model than the annotated one.
 
     If the named model no longer exists, it counts as renamed, and a warning is logged.
     """
-    if named is None or named.resolve() == model.resolve():
+    if named is None or (model is not None and named.resolve() == model.resolve()):
         return
+    if model is None:
+        fix = f"give the model, too, or {_OTHER_FOLDER}"
+        raise DataError(f"belongs to the model {named.resolve()}", where=str(where), fix=fix)
     if not named.exists():
         logger.warning("%s: its model %s no longer exists, %s is used instead", where, named, model)
         return

@@ -20,6 +20,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
+from cadalign.shapes.pretrained import CATEGORIES
 
 _LONGEST = 1000  # history, in marks
 _LONGEST_NAME = 80
@@ -175,11 +176,15 @@ class KeypointRegistry:
     """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
 
     New points do not get ``reserved`` ids. Points at most ``tolerance`` apart [model units] are the
-    same point. The attribute ``file_ids`` holds the ids that were read from files.
+    same point. The attribute ``file_ids`` holds the ids that were read from files. The keypoints of
+    a learned shape are ``fixed``: they keep their names, and files add none.
     """
 
-    def __init__(self, *, reserved: Iterable[int] = (), tolerance: float = 0.0) -> None:
+    def __init__(
+        self, *, reserved: Iterable[int] = (), tolerance: float = 0.0, fixed: bool = False
+    ) -> None:
         self._tolerance = tolerance
+        self.fixed = fixed
         self._points: dict[int, ModelKeypoint] = {}
         self._last_reserved = max(reserved, default=0)
         self.file_ids = frozenset[int]()
@@ -223,6 +228,13 @@ class KeypointRegistry:
         own = None if point.semantic_id is None else self._points.get(point.semantic_id)
         return own is not None and self.find(point.xyz, among=[own]) is not None
 
+    def same(self, point: ModelKeypoint) -> int | None:
+        """Find the id of the keypoint with the point's name, or with its id if it has no name."""
+        for number, own in self:
+            if own.name == point.name if point.name else number == point.semantic_id:
+                return number
+        return None
+
     def find(
         self, xyz: Sequence[float], *, among: Iterable[ModelKeypoint] | None = None
     ) -> int | None:
@@ -241,6 +253,9 @@ class KeypointRegistry:
             what = f"the name {name[:_LONGEST_NAME]!r} is empty or too long"
             raise InputError(what, where="name", fix=f"give 1 to {_LONGEST_NAME} characters")
         point = self[semantic_id]
+        if self.fixed and name != point.name:
+            what = f"{point.name!r} is a keypoint of the shape, which keeps its name"
+            raise InputError(what, where="name")
         if name != point.name and name in self._names:
             what = f"another keypoint is called {name!r}"
             raise InputError(what, where="name", fix="choose another name")
@@ -263,6 +278,13 @@ class ObjectShape:
 
     learned: ShapeModel | None = None
     path: Path | None = None
+
+    @property
+    def category(self) -> str | None:
+        """Name of the category whose shape comes with cadalign; None for a shape from a file."""
+        path = self.path
+        is_own = path is not None and path.name in CATEGORIES and not path.is_file()
+        return path.name if path is not None and is_own else None
 
     @classmethod
     def open(cls, path: Path | None) -> ObjectShape:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +36,20 @@ _MOST_LINES = 3000
 _CREASE_DEG = 30.0
 _LONGEST = 1 / 24  # line [diagonals]: each line is drawn or hidden as a whole
 _BOX_PIECES = 16
+
+
+class Lines(Protocol):
+    """Lines of a model that are drawn over the photo."""
+
+    @property
+    def creases(self) -> FloatArray:
+        """The lines that always show, (k, 2, 3) float [model units]."""
+
+    def warp(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Lines:
+        """Warp the lines, so that points ``source`` (m, 3) move to ``target`` (m, 3)."""
+
+    def project(self, camera: Camera, alignment: Alignment) -> FloatArray:
+        """Project the visible lines of the stretched model to pixels (k, 2, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +97,11 @@ class Wireframe:
         ends = vertices[self._smooth]
         outline = ends[_is_outline(ends, vertices[self._opposite], eye)]
         lines = np.concatenate([vertices[self._creases], outline])
-        lines = _split_lines(lines, self._piece)[:_MOST_LINES]
+        lines = split_lines(lines, self._piece)[:_MOST_LINES]
         if not len(lines):
             return np.empty((0, 2, 2))
         seen = visible_keypoints(self.scene, lines.mean(axis=1), camera, alignment)
-        return _project_lines(lines[seen], camera, alignment)
+        return project_lines(lines[seen], camera, alignment)
 
 
 def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
@@ -96,10 +111,10 @@ def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> Float
     share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
     points = (ends[:, 0] * (1 - share) + ends[:, 1] * share).transpose(1, 0, 2)
     lines = np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
-    return _project_lines(lines, camera, Alignment.identity())
+    return project_lines(lines, camera, Alignment.identity())
 
 
-def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
+def project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
     """Project lines (k, 2, 3) to (k, 2, 2) [px]; drop those with an end behind the camera."""
     ends = alignment.apply(lines.reshape(-1, 3)).reshape(-1, 2, 3)
     near = 1e-6 * np.abs(alignment.translation).max(initial=1.0)
@@ -122,7 +137,8 @@ def _is_outline(ends: FloatArray, opposite: FloatArray, eye: FloatArray) -> Bool
     return np.asarray(sides[:, 0] * sides[:, 1] > 0)
 
 
-def _split_lines(lines: FloatArray, piece: float) -> FloatArray:
+def split_lines(lines: FloatArray, piece: float) -> FloatArray:
+    """Split lines (k, 2, 3) into pieces that are at most ``piece`` long."""
     if not len(lines):
         return lines
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
@@ -138,6 +154,9 @@ def _split_lines(lines: FloatArray, piece: float) -> FloatArray:
 class ClickableModel:
     """A mesh that can be clicked on; centre and diagonal are its box's [model units]."""
 
+    missed = "That click missed the model."
+    """Message for a click that picks nothing."""
+
     def __init__(self, mesh: Mesh) -> None:
         self.scene = Scene(mesh)
         low, high = self.scene.bounds
@@ -147,7 +166,7 @@ class ClickableModel:
             raise InputError("all vertices of the mesh coincide", where=mesh.source)
 
     @cached_property
-    def wireframe(self) -> Wireframe:
+    def wireframe(self) -> Lines:
         """The lines of the model."""
         return Wireframe.from_scene(self.scene)
 
@@ -199,13 +218,21 @@ class ClickableModel:
 
 @dataclass(eq=False)
 class MarkedModel:
-    """A model that can be clicked on, its keypoints, and the file they are written to."""
+    """A model that can be clicked on, its keypoints, and the file they are written to.
 
-    path: Path
+    Without a ``path`` it is the skeleton of a learned shape, and nothing is written.
+    """
+
+    path: Path | None
     cad: ClickableModel
     registry: KeypointRegistry
     keypoints_path: Path
-    content: LastContent  # of the keypoints file
+    content: LastContent = field(default_factory=LastContent)  # of the keypoints file
+
+    @property
+    def is_skeleton(self) -> bool:
+        """True for the skeleton of a learned shape."""
+        return self.path is None
 
     def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
         """The model points of pairs that have one."""
@@ -214,6 +241,8 @@ class MarkedModel:
     def write_keypoints(self, used: frozenset[int]) -> None:
         """Write all keypoints that are in use or from files; raises DataError on failure."""
         registry = self.registry
+        if self.path is None:
+            return
         self.content.refuse_changed(self.keypoints_path)
         kept = (point for number, point in registry if number in registry.file_ids | used)
         ModelKeypoints(tuple(kept), self.path).save(self.keypoints_path)

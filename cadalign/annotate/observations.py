@@ -21,6 +21,7 @@ from cadalign.annotate.files import LastContent, refuse_other_model, refuse_othe
 from cadalign.annotate.marks import KeypointRegistry, Marks, ObjectShape, Pair, positions_of
 from cadalign.annotate.model import MarkedModel
 from cadalign.annotate.photos import ObjectMask, PhotoFile, camera_of
+from cadalign.annotate.skeleton import open_skeleton
 from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
@@ -88,6 +89,10 @@ class ObservationFile:
             what = f"has {len(stored.views)} views, the annotator only opens files of one photo"
             raise DataError(what, where=str(self.path), fix=_OTHER_FILE)
         refuse_other_model(stored.model, self.model.path, where=self.path)
+        if self.shape.category and self.model.is_skeleton and stored.shape is not None:
+            own = ObjectShape.open(stored.shape)
+            if own.category not in (None, self.shape.category):
+                self.model, self.shape = open_skeleton(own), own
         refuse_other_photo(stored.image, self.photo.path, where=self.path)
         self._warn_of_options(stored)
         with in_file(self.path), within("unfinished"):
@@ -175,10 +180,16 @@ class ObservationFile:
             evidence=evidence,
             model=self.model.path,
             fit_options=options,
-            shape=self.shape.path,
+            shape=self._shape_file,
             init=marks.start if len(pairs) < LEAST_JOINT_PAIRS else None,
             unfinished={"pairs": halves} if halves else None,
         )
+
+    @property
+    def _shape_file(self) -> Path | None:
+        """The shape's file; a category stands beside the observation, which then names it alone."""
+        category = self.shape.category
+        return self.shape.path if category is None else self.path.parent / category
 
     def _half(self, pair: Pair) -> dict[str, Any]:
         """Return a pair as the field ``unfinished`` stores it."""
@@ -241,8 +252,8 @@ def _add_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistr
     """Add unfinished pairs to the marks, except pairs of which no half is left."""
     for half in halves:
         keypoint = half.semantic_id
-        if half.xyz is not None:
-            point = ModelKeypoint(half.name or "", half.xyz, keypoint)
+        if half.xyz is not None or registry.fixed:
+            point = ModelKeypoint(half.name or "", half.xyz or (0, 0, 0), keypoint)
             keypoint = _register(point, registry, marks.keypoints)
         elif keypoint not in registry or keypoint in marks.keypoints:
             keypoint = None
@@ -266,9 +277,17 @@ def _add_pairs(marks: Marks, observation: Observation, registry: KeypointRegistr
     return marks
 
 
-def _register(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:
-    """Find a point of an observation file in the registry, or add it; returns its id."""
+def _register(
+    point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]
+) -> int | None:
+    """Find a point of an observation file in the registry, or add it; returns its id.
+
+    Returns None if the registry is fixed and has no such point.
+    """
     wanted = point.semantic_id
+    if registry.fixed:
+        known = registry.same(point)
+        return None if known in taken else known
     if wanted is not None and wanted not in taken and registry.has(point):
         return wanted
     found = registry.find(point.xyz)

@@ -20,6 +20,7 @@ from cadalign.geometry.alignment import (
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
 from cadalign.render.layers import confidence_regions
+from cadalign.shapes.pretrained import CATEGORIES
 
 _LABELS = {"up": "gravity", "camera_height": "camera height", "cam_from_rig": "camera pose"}
 _LEFT_OPEN = 0.8  # of a prior's standard deviation; beyond it, the pairs add no information
@@ -71,6 +72,12 @@ def page_state(
                 for keypoint, point in registry
             ],
             "shape": _shape(state),
+            "model": {
+                "key": state.shape.category or "",
+                "is_skeleton": state.model.is_skeleton,
+                "proposed": state.proposed(live),
+                "categories": CATEGORIES if state.can_exchange else (),
+            },
             "alignment": _alignment(state, live, is_ready=session.ready),
         }
 
@@ -156,7 +163,11 @@ def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
         known = np.array([label in free for label in result.ids], dtype=bool)
         rows = np.flatnonzero(known & camera.sees(in_camera))
         pixels, covariances = camera.project(in_camera[rows]), result.points_cam_covariance
-        unmarked = np.round(pixels, 1).tolist()
+        number_of: dict[Any, int] = {shape.id_of(point): number for number, point in registry}
+        unmarked = [
+            {"keypoint": number_of[result.ids[row]], "uv": uv}
+            for row, uv in zip(rows, np.round(pixels, 1).tolist(), strict=True)
+        ]
         if covariances is not None:
             places = camera.projected_covariances(in_camera[rows], covariances[rows])
             regions = [_close(region) for region in confidence_regions(pixels, places)]

@@ -114,7 +114,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
         "/": routes.page,
         "/annotate.js": partial(_asset, "annotate.js", "text/javascript"),
         "/annotate.css": partial(_asset, "annotate.css", "text/css"),
-        "/model": routes.model,
+        "/model/{number:int}": routes.model,
         "/photos": routes.photos,
         "/photo/{number:int}": routes.photo,
         "/mask/{number:int}": routes.mask,
@@ -177,7 +177,7 @@ class _Routes:
 
     def model(self, request: Request) -> Response:
         with self._session.lock:
-            data = self._session.model.cad.display_bytes
+            data = self._annotation(request).model.cad.display_bytes
         return Response(data, media_type="application/octet-stream")
 
     def photos(self, request: Request) -> Response:

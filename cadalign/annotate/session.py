@@ -18,10 +18,11 @@ from cadalign.annotate.files import (
     refuse_collisions,
 )
 from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel, positions_of
-from cadalign.annotate.model import MarkedModel, Wireframe, open_model
+from cadalign.annotate.model import Lines, MarkedModel, open_model
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS, ObservationFile
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
 from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors, warm_up
+from cadalign.annotate.skeleton import next_row, open_skeleton
 from cadalign.arrays import BoolArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
@@ -41,7 +42,7 @@ class LiveAlignment:
     message: str = ""
     counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
     """Mask (n,) of the complete pairs that count."""
-    wireframe: Wireframe | None = None
+    wireframe: Lines | None = None
     """Lines of the model before the stretch, warped to a learned shape."""
 
     @property
@@ -57,11 +58,14 @@ def missing_text(counts: BoolArray, shape: ObjectShape, observation: Observation
     """
     if shape.learned is None and (observation.evidence.mask or observation.init):
         return ""
-    is_plain = observation.is_plain and shape.learned is None
+    # Three pairs leave a learned shape without a model too uncertain to be of use.
+    is_plain = observation.is_plain and (shape.learned is None or observation.model is None)
     missing = (_LEAST_PAIRS if is_plain else LEAST_JOINT_PAIRS) - int(counts.sum())
     if missing <= 0:
         return ""
     text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
+    if observation.model is None:
+        return f"{text}."
     if not counts.all() and shape.learned is not None:
         text += f": keypoints that {shape.learned.category} has, the white points on the model"
     return text
@@ -78,6 +82,8 @@ class Annotation:
     """True if it was saved before the solvers were ready, without the estimated noise."""
     live: tuple[Marks, LiveAlignment] | None = None
     """The last alignment, with its marks."""
+    skipped: set[int] = field(default_factory=set)
+    """Keypoints that are not proposed any more."""
     _estimated: tuple[str, LiveEstimate] | None = None  # with a key of its input
 
     @property
@@ -103,6 +109,37 @@ class Annotation:
     def record(self, marks: Marks) -> None:
         """Set the current marks."""
         self.history.record(marks)
+
+    def proposed(self, live: LiveAlignment) -> int | None:
+        """The keypoint of a skeleton to mark next; None for a model, or if there is none."""
+        learned = self.shape.learned
+        if learned is None or not self.model.is_skeleton:
+            return None
+        numbers = [number for number, _ in self.model.registry]
+        rows = [row for row, number in enumerate(numbers) if number in self.marks.keypoints]
+        done = self.marks.keypoints | self.skipped
+        left = [row for row, number in enumerate(numbers) if number not in done]
+        row = next_row(learned.mean[: len(numbers)], rows, left, live.result)
+        return None if row is None else numbers[row]
+
+    @property
+    def can_exchange(self) -> bool:
+        """True if the category of the object can be exchanged."""
+        return self.model.is_skeleton and self.shape.category is not None
+
+    def exchange_shape(self, shape: ObjectShape) -> None:
+        """Mark the keypoints of another shape; pairs of equal names stay, others lose theirs."""
+        model, before, marks = open_skeleton(shape), self.model.registry, self.marks
+        changed = [
+            each
+            if each.keypoint is None
+            else replace(each, keypoint=model.registry.same(before[each.keypoint]))
+            for each in marks.pairs
+        ]
+        kept = [each for each in changed if each.uv is not None or each.keypoint is not None]
+        self.file.model, self.file.shape = model, shape
+        self.history = History(replace(marks, pairs=tuple(kept), start=None))
+        self.skipped.clear()
 
     @property
     def mask(self) -> BoolArray:
@@ -241,6 +278,11 @@ SessionFiles = list[tuple[PhotoFile, Path]]
 def find_session_files(options: SessionOptions) -> SessionFiles:
     """Find the photos and name their files; raises InputError if files would collide."""
     image, given = options.image, options.observation
+    if options.model is None and options.shape is None:
+        fix = "give the CAD model, or a category, such as --shape chair"
+        raise InputError("neither a model nor a shape is given", where="MODEL", fix=fix)
+    if options.model is None and options.keypoints is not None:
+        raise InputError("given without a model", where="--keypoints", fix="give the model, too")
     paths = find_photos(image)
     if given is not None and (image.is_dir() or options.out is not None):
         what = "names the file of a single photo, but a folder is given too"
@@ -252,11 +294,14 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
     observations = [] if given is None else [given]
     for photo in photos[len(observations) :]:
         observations.append(observation_file(photo.path, out, observations))
-    keypoints = keypoints_file(options.model, out)
     read: list[Any] = [options.model, options.camera, *(photo.path for photo in photos)]
-    if options.keypoints != keypoints:
-        read.append(options.keypoints)
-    refuse_collisions([keypoints, *observations], [path for path in read if path is not None])
+    written = observations
+    if options.model is not None:
+        keypoints = keypoints_file(options.model, out)
+        written = [keypoints, *observations]
+        if options.keypoints != keypoints:
+            read.append(options.keypoints)
+    refuse_collisions(written, [path for path in read if path is not None])
     return list(zip(photos, observations, strict=True))
 
 
@@ -264,7 +309,12 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
     """Open an annotation session: read photos, model, camera and earlier annotations."""
     files = files or find_session_files(options)
     shape, (first, path) = ObjectShape.open(options.shape), files[0]
-    model = open_model(options.model, path.parent, keypoints=options.keypoints, shape=shape)
+    up_axis = options.up_axis
+    if options.model is None:
+        model = open_skeleton(shape)
+        up_axis = up_axis or (None if shape.learned is None else shape.learned.up_axis)
+    else:
+        model = open_model(options.model, path.parent, keypoints=options.keypoints, shape=shape)
     size = first.width, first.height
     given = None if options.camera is None else read_camera(options.camera, size=size)
     session = Session(model, shape)
@@ -273,7 +323,7 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
         if options.focal is not None:
             camera = camera.with_focal(options.focal)
         file = ObservationFile(path, photo, model, shape)
-        marks = file.read(camera, up_axis=options.up_axis)
+        marks = file.read(camera, up_axis=up_axis)
         session.photos.append(Annotation(file, History(marks)))
     return session
 

@@ -26,12 +26,14 @@ class Annotate(SessionOptions):
 
     Serves a page that only this machine can open. Saves every change at once: an observation beside
     each photo (photo.json), for `cadalign fit`, and the model's keypoints (model.keypoints.json).
+    Without a model: `cadalign annotate photo.jpg --shape chair`.
     """
 
     image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTO")]
     """A photo, or a folder of photos."""
-    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """The model: an OBJ, PLY, GLB, glTF, STL or OFF file."""
+    model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = None
+    """The model: an OBJ, PLY, GLB, glTF, STL or OFF file. With --shape it may be left out: the
+    keypoints of the shape are marked in the photo alone, one after the other."""
     port: int = 0
     """Port of the page; 0 selects a free port."""
     no_open: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -44,7 +46,8 @@ class Annotate(SessionOptions):
         from cadalign.annotate.server import Access, listen, make_app, make_server
         from cadalign.annotate.session import find_session_files, open_session
 
-        if [kind_of_file(path) for path in (self.image, self.model)] == [MESH, PHOTO]:
+        given = [path for path in (self.image, self.model) if path is not None]
+        if [kind_of_file(path) for path in given] == [MESH, PHOTO]:
             what = f"{self.image} is a mesh and {self.model} is a photo: swap them"
             raise UsageError(what, where="PHOTO MODEL", fix="cadalign annotate PHOTO MODEL")
         listener = listen(self.port)
@@ -82,5 +85,5 @@ def _save(session: Session) -> int:
     for trouble in sorted({each.save_error for each in session.unsaved}):
         say(f"Not saved: {trouble}")
     if not session.unsaved:
-        say(f"Saved in {session.model.keypoints_path.parent.absolute()}")
+        say(f"Saved in {session.photos[0].file.path.parent.absolute()}")
     return bool(session.unsaved)

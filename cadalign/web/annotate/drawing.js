@@ -5,6 +5,7 @@ const KINDS = {
   selected: { fill: "#0b2e66", ring: "#ffd23f", radius: 13 },
   wrong: { fill: "#b3261e", ring: "#ffffff", radius: 11 },
   free: { fill: "#ffffff", ring: "#3a4048", radius: 5 },
+  proposed: { fill: "#ffd23f", ring: "#3a4048", radius: 9 },
   axis: { fill: "#3a4048", ring: "#a4abb5", radius: 9 },
 };
 

@@ -18,6 +18,7 @@ export class Layout {
     this.photo = h("div", { class: "host" });
     this.model = h("div", { class: "host" });
     this.box = button("Mask by a box", handlers.boxing, { title: "Drag a box around the object (X)", "aria-pressed": "false" });
+    this.skip = button("Skip", () => act({ do: "skip" }), { title: "Propose another keypoint (S)" });
     this.asPhoto = button("As photo", handlers.asPhoto, { title: "Look from where the photo was taken (V)" });
     this.help = makeHelp();
     document.body.classList.add("waiting"); // for the first state, which says what there is
@@ -35,7 +36,7 @@ export class Layout {
       h(
         "main",
         {},
-        view("Photo", this.photo, handlers.photo, this.box),
+        view("Photo", this.photo, handlers.photo, [this.skip, this.box]),
         view("Model", this.model, handlers.model, this.asPhoto),
         this.status,
         panel,
@@ -56,6 +57,7 @@ export class Layout {
     this.undo.disabled = !state.can_undo;
     this.redo.disabled = !state.can_redo;
     this.asPhoto.disabled = alignment.status !== "done";
+    this.skip.hidden = !state.model.is_skeleton;
     this.box.hidden = !state.evidence.outline;
     this.saved.classList.toggle("wrong", Boolean(saved.trouble));
     this.saved.textContent = saved.trouble ? `Not saved: ${saved.trouble}` : `Every change is saved in ${saved.path}`;
@@ -97,9 +99,20 @@ function warningsOf({ pairs, alignment }) {
 }
 
 /** What is missing to an alignment. */
-function progressOf({ pairs, alignment }) {
+function progressOf({ pairs, alignment, model, keypoints }) {
+  if (model.is_skeleton && alignment.status !== "preparing") return `${askOf(pairs, model, keypoints)} ${alignment.message}`;
   const how = "Click a point in the photo and the same point on the model, in either order.";
   return pairs.length || alignment.status !== "none" ? alignment.message : `${how} ${alignment.message}`;
+}
+
+/** What to click on next, without a model. */
+function askOf(pairs, { proposed }, keypoints) {
+  const pending = pairs.find(({ uv, keypoint }) => uv === null || keypoint === null);
+  if (pending?.keypoint === null) return `Pair ${pending.pair}: choose its keypoint on the right.`;
+  if (pending) return `Click in the photo: ${pending.name}.`;
+  const next = keypoints.find(({ keypoint }) => keypoint === proposed);
+  if (next) return `Click in the photo: ${next.name}. Or choose another on the right; S skips it.`;
+  return keypoints.every(({ used }) => used) ? "All keypoints are marked." : "The other keypoints were skipped. S proposes them again.";
 }
 
 function view(name, host, { zoom, fit }, tools) {

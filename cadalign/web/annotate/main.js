@@ -39,7 +39,8 @@ class App {
       this.panel.root,
     );
     this.photo = new PhotoView(this.layout.photo, {
-      onPlace: (uv) => act({ do: "place_uv", uv, pair: this.selected }),
+      onPlace: (uv) => this.place(uv),
+      onTake: (keypoint, uv) => act({ do: "take", keypoint, uv }),
       onMove: (pair, uv) => act({ do: "move", pair, uv }),
       onBox: (corners) => {
         this.boxing(false);
@@ -59,8 +60,12 @@ class App {
 
   async start() {
     await this.open();
+  }
+
+  /** Show the model of a photo: without a CAD model, each may have another. */
+  async loadModel({ image, model }) {
     try {
-      await this.model.load();
+      await this.model.load(image.number, model);
     } catch (error) {
       this.layout.say(`The model cannot be shown: ${error.message}`);
     }
@@ -89,6 +94,10 @@ class App {
       this.opened = image.number;
       this.photo.open(image.number, image);
       if (image.count > 1) this.listPhotos();
+    }
+    if (this.modelKey !== state.model.key) {
+      this.modelKey = state.model.key;
+      this.loadModel(state);
     }
     if (state.selected !== null) this.selected = state.selected;
     if (!state.pairs.some(({ pair }) => pair === this.selected)) this.selected = null;
@@ -122,6 +131,14 @@ class App {
     if (!state) return this.draw(); // as it was
     await new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)));
     this.redrawn = performance.now() - start;
+  }
+
+  /** Place a point in the photo: of the pair that lacks it, or of the proposed keypoint. */
+  place(uv) {
+    const { pairs, model } = this.state;
+    const isPending = pairs.some((pair) => pair.uv === null);
+    if (isPending || model.proposed === null) return this.act({ do: "place_uv", uv, pair: this.selected });
+    return this.act({ do: "take", keypoint: model.proposed, uv });
   }
 
   select(pair) {

@@ -50,9 +50,11 @@ export class ModelView {
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));
   }
 
-  /** Fetch and show the model. */
-  async load() {
-    const buffer = await (await fetched("model")).arrayBuffer();
+  /** Fetch and show the model of a photo. */
+  async load(number, { key, is_skeleton: isSkeleton }) {
+    const buffer = await (await fetched(`model/${number}?${key}`)).arrayBuffer();
+    this.isSkeleton = isSkeleton;
+    this.wasAligned = false;
     const [faces, edges] = new Uint32Array(buffer, 0, 2);
     let offset = 8;
     const take = (vertices) => {
@@ -74,7 +76,9 @@ export class ModelView {
     const axes = new AxesHelper(1);
     axes.scale.copy(this.ends);
     const grey = new LineBasicMaterial({ color: 0x7d8794, transparent: true, opacity: 0.4 });
-    this.stage.scene.add(new Group().add(this.mesh, new LineSegments(creases, grey), axes));
+    if (this.group) this.stage.scene.remove(this.group);
+    this.group = new Group().add(this.mesh, new LineSegments(creases, grey), axes);
+    this.stage.scene.add(this.group);
     this.frame();
     if (this.state) this.show(this.state, this.selected);
   }
@@ -106,10 +110,15 @@ export class ModelView {
       this.upAxis = state.image.up_axis;
       this.frame();
     }
-    const { keypoints, pairs } = state;
+    const { keypoints, pairs, alignment, model } = state;
+    const isAligned = alignment.status === "done";
+    if (this.isSkeleton && isAligned && !this.wasAligned) this.frameAsPhoto();
+    this.wasAligned = isAligned;
     const end = (label) => new Vector3().setComponent("xyz".indexOf(label), this.ends[label]).toArray();
     const axes = this.mesh ? [..."xyz"].map((label) => ({ kind: "axis", label, xyz: end(label), fixed: true })) : [];
-    const free = keypoints.filter(({ used }) => !used).map((point) => ({ kind: "free", label: "", ...point }));
+    const free = keypoints.filter(({ used }) => !used).map((point) => ({
+      kind: point.keypoint === model.proposed ? "proposed" : "free", label: "", ...point,
+    }));
     const placed = pairs.filter(({ xyz }) => xyz).map((pair) => ({
       kind: kindOf(pair, selected), label: String(pair.pair), xyz: pair.xyz, pair: pair.pair, name: pair.name,
     }));
@@ -175,7 +184,7 @@ export class ModelView {
   }
 
   isHidden(xyz) {
-    if (!this.mesh) return false;
+    if (!this.mesh || this.isSkeleton) return false;
     const { position } = this.stage.camera;
     const sight = new Vector3(...xyz).sub(position);
     const distance = sight.length();

@@ -17,13 +17,14 @@ export class Panel {
       "section",
       { class: "panel", "aria-label": "Results" },
       h("section", { class: "card" }, h("h2", {}, "Alignment"), this.facts, this.notes),
-      h("section", { class: "card" }, h("h2", {}, "Evidence"), this.makeEvidence()),
+      h("section", { class: "card" }, h("h2", {}, "Evidence"), this.makeCategory(), this.makeEvidence()),
       h("section", { class: "card" }, this.title, this.rows),
     );
   }
 
   show(state, selected) {
     this.showAlignment(state.alignment);
+    this.showCategory(state.model);
     this.showEvidence(state);
     this.showKeypoints(state.keypoints);
     this.showPairs(state, selected);
@@ -34,6 +35,23 @@ export class Panel {
     const fact = ({ label, value, note }) => h("div", {}, h("dt", {}, label), h("dd", {}, h("strong", {}, value), " ", note));
     this.facts.replaceChildren(...facts.map(fact));
     this.notes.replaceChildren(...notes.slice(1).map((note) => h("li", {}, note)));
+  }
+
+  /** The category of the object, without a model. */
+  makeCategory() {
+    const change = () => this.handlers.act({ do: "category", name: this.category.value });
+    this.category = h("select", { onchange: change });
+    const title = "Pairs of keypoints with the same name stay. It cannot be undone.";
+    this.categories = h("label", { title }, "Category in this photo: ", this.category);
+    return this.categories;
+  }
+
+  showCategory({ key, categories }) {
+    this.categories.hidden = !categories.length;
+    if (this.category.children.length !== categories.length) {
+      this.category.replaceChildren(...categories.map((name) => h("option", {}, name)));
+    }
+    this.category.value = key;
   }
 
   makeEvidence() {
@@ -86,7 +104,8 @@ export class Panel {
     this.hasKeypoints = free.length > 0;
   }
 
-  showPairs({ pairs, shape }, selected) {
+  showPairs({ pairs, shape, model }, selected) {
+    this.isFixed = model.is_skeleton;
     this.title.textContent = pairs.length ? `Pairs (${pairs.length})` : "Pairs: none yet";
     const key = this.rows.contains(document.activeElement) ? document.activeElement.dataset.key : null;
     this.rows.replaceChildren(...pairs.map((pair) => this.row(pair, shape, pair.pair === selected)));
@@ -119,6 +138,7 @@ export class Panel {
 
   name({ pair, keypoint, name }) {
     if (keypoint === null) return h("span", {}, "click the model", this.hasKeypoints && [" or ", this.keypoints]);
+    if (this.isFixed) return h("span", { title: name }, name);
     return h("input", {
       value: name,
       maxLength: 80,

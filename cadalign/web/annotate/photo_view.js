@@ -4,19 +4,21 @@ import { drawBadge, kindOf, strokeTwice } from "./drawing.js";
 
 const CLICK_REACH = 4; // a press that moves no farther is a click [px]
 const REACH = 16; // of a point to the pointer [px]
+const RING_REACH = 8; // of an estimated keypoint to the pointer [px]
 const WHEEL = 0.0016;
 const MARGIN = 12;
 const MOST_ZOOM = 64;
 const PIXELS_FROM = 4; // from this zoom on, pixels are shown as squares
 const BADGE_OFFSET = 17;
 const MASK = "#b04dff";
+const PROPOSED = "#ffd23f"; // the keypoint to click on next
 const UNCERTAIN = "#ff96e1"; // estimated keypoints that are not marked, and their regions
 
 export class PhotoView {
   /**
    * @param {HTMLElement} host - the element to fill
-   * @param {object} handlers - onPlace(uv), onSelect(pair), onMove(pair, uv), onBox(corners),
-   *   onTrouble(text)
+   * @param {object} handlers - onPlace(uv), onTake(keypoint, uv), onSelect(pair), onMove(pair, uv),
+   *   onBox(corners), onTrouble(text)
    */
   constructor(host, handlers) {
     this.host = host;
@@ -38,6 +40,7 @@ export class PhotoView {
     this.state = null;
     this.selected = null;
     this.dragged = null; // the pair that is moved, and where to
+    this.draggedRing = null; // the estimated keypoint that is moved, likewise
     this.isBoxing = false; // a drag draws a box, in place of panning
     this.box = null; // two corners
     this.listen();
@@ -163,12 +166,21 @@ export class PhotoView {
 
   /** The pair whose point is at a place of the view, if any. */
   pairAt(place) {
+    return this.nearest(this.state?.pairs.filter(({ uv }) => uv) ?? [], place, REACH);
+  }
+
+  /** The estimated keypoint that is at a place of the view, if any; only without a CAD model. */
+  ringAt(place) {
+    const { model, alignment } = this.state ?? {};
+    return model?.is_skeleton && !this.hidden ? this.nearest(alignment.unmarked ?? [], place, RING_REACH) : null;
+  }
+
+  nearest(points, place, reach) {
     const gap = ({ uv }) => {
       const own = this.toView(uv);
       return Math.hypot(own.x - place.x, own.y - place.y);
     };
-    const points = this.state?.pairs.filter((pair) => pair.uv && gap(pair) < REACH) ?? [];
-    return points.sort((a, b) => gap(a) - gap(b))[0] ?? null;
+    return points.filter((point) => gap(point) < reach).sort((a, b) => gap(a) - gap(b))[0] ?? null;
   }
 
   listen() {
@@ -188,23 +200,31 @@ export class PhotoView {
     if (event.button !== 0 || !event.isPrimary) return;
     this.canvas.setPointerCapture(event.pointerId);
     const pair = this.isBoxing ? null : this.pairAt(place);
+    const ring = this.isBoxing || pair ? null : this.ringAt(place);
     // The point does not jump to the pointer: it keeps its distance.
-    const own = pair && this.toView(pair.uv);
+    const own = (pair ?? ring) && this.toView((pair ?? ring).uv);
     const grip = own && { x: own.x - place.x, y: own.y - place.y };
-    this.press = { start: place, last: place, pair, grip, moved: false };
+    this.press = { start: place, last: place, pair, ring, grip, moved: false };
   }
 
   move(event, place) {
     const { press } = this;
     if (!press) {
-      this.canvas.style.cursor = !this.isBoxing && this.pairAt(place) ? "grab" : "crosshair";
+      const ring = this.ringAt(place);
+      const keypoint = ring && this.state.keypoints.find((each) => each.keypoint === ring.keypoint);
+      this.canvas.title = keypoint?.name ?? "";
+      this.canvas.style.cursor = !this.isBoxing && (ring || this.pairAt(place)) ? "grab" : "crosshair";
       return;
     }
-    const { start, last, pair, grip } = press;
+    const { start, last, pair, ring, grip } = press;
     press.moved ||= Math.hypot(place.x - start.x, place.y - start.y) > CLICK_REACH;
     if (!press.moved) return;
     if (this.isBoxing) this.box = [start, place].map((corner) => this.clamp(this.toPixel(corner)));
-    else if (pair) this.drag(pair.pair, this.toPixel({ x: place.x + grip.x, y: place.y + grip.y }));
+    else if (pair || ring) {
+      const uv = this.toPixel({ x: place.x + grip.x, y: place.y + grip.y });
+      if (pair) this.drag(pair.pair, uv);
+      else this.draggedRing = { ...ring, uv: this.clamp(uv) };
+    }
     else this.pan(place.x - last.x, place.y - last.y);
     press.last = place;
     this.invalidate();
@@ -214,15 +234,20 @@ export class PhotoView {
     const { press, box } = this;
     this.press = null;
     if (!press) return;
-    const { start, pair, moved } = press;
+    const { start, pair, ring, moved } = press;
+    const { draggedRing } = this;
+    this.draggedRing = null;
     if (moved && this.isBoxing) this.handlers.onBox(box);
     else if (moved && pair) this.handlers.onMove(pair.pair, this.dragged.uv);
     else if (!moved && pair) this.handlers.onSelect(pair.pair);
+    else if (moved && ring) this.handlers.onTake(ring.keypoint, draggedRing.uv);
+    // The proposed keypoint is placed where the click is, which may be beside its estimate.
+    else if (ring && ring.keypoint !== this.state.model.proposed) this.handlers.onTake(ring.keypoint, ring.uv);
     else if (!moved && !this.isBoxing) this.place(start);
   }
 
   cancel() {
-    this.press = this.dragged = this.box = null;
+    this.press = this.dragged = this.draggedRing = this.box = null;
     this.invalidate();
   }
 
@@ -287,11 +312,12 @@ export class PhotoView {
     this.stroke(lines, "#35d0ff", 1.2);
     this.stroke(box, "#ff5a63", 2);
     this.stroke(regions, UNCERTAIN, 1.2);
-    for (const uv of unmarked) {
+    for (const each of unmarked) {
+      const { keypoint, uv } = this.draggedRing?.keypoint === each.keypoint ? this.draggedRing : each;
       const { x, y } = this.toView(uv);
       this.context.beginPath();
       this.context.arc(x, y, 3.5, 0, 2 * Math.PI);
-      strokeTwice(this.context, UNCERTAIN, 1.8);
+      strokeTwice(this.context, keypoint === this.state.model.proposed ? PROPOSED : UNCERTAIN, 1.8);
     }
   }
 

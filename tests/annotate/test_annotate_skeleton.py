@@ -1,0 +1,269 @@
+"""The annotator without a CAD model: proposals, estimated keypoints, and categories."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+from playwright.sync_api import Browser, expect
+from support.annotating import opened_page, place_of_pixel, wait
+
+from cadalign import Alignment, Camera, CadalignError, ShapeModel
+from cadalign.annotate.actions import perform
+from cadalign.annotate.files import SessionOptions
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session, open_session
+from cadalign.cli import main
+from cadalign.io.observation import Observation
+
+CAMERA = Camera(800, 600, 900.0, 900.0, 399.5, 299.5)
+LEGGED = slice(0, 10), slice(17, 21)
+"""Rows of the chair's back, seat and armrests, and of its legs."""
+
+
+def chair_pixels() -> dict[str, list[float]]:
+    """Pixels of the keypoints of a chair with four legs, by name."""
+    shape = ShapeModel.pretrained("chair")
+    eye = np.array([1.1, 0.9, -1.9])
+    ahead = -eye / np.linalg.norm(eye)
+    right = np.cross(ahead, [0, 1, 0])
+    axes = np.stack([right / np.linalg.norm(right), np.cross(ahead, right), ahead])
+    axes[1] /= np.linalg.norm(axes[1])
+    pose = Alignment(axes, -axes @ eye)
+    pixels = CAMERA.project(pose.apply(shape.mean[: len(shape.ids)]))
+    rows = [row for part in LEGGED for row in range(part.start, part.stop)]
+    return {shape.names[row]: pixels[row].tolist() for row in rows}
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    """A picture of the chair's skeleton."""
+    shape, pixels = ShapeModel.pretrained("chair"), chair_pixels()
+    image = Image.new("RGB", (CAMERA.width, CAMERA.height), "#d9d4c8")
+    draw = ImageDraw.Draw(image)
+    for start, end in shape.lines:
+        ends = [pixels.get(shape.names[row]) for row in (start, end)]
+        if None not in ends:
+            draw.line([tuple(each) for each in ends if each], fill="#7a4a21", width=9)
+    path = tmp_path / "photo.png"
+    image.save(path)
+    return path
+
+
+def opened(photo: Path, shape: str = "chair", *, ready: bool = False, **options: Any) -> Session:
+    session = open_session(SessionOptions(image=photo, shape=Path(shape), **options))
+    session.ready = ready
+    return session
+
+
+def named(state: dict[str, Any], number: int | None) -> str:
+    names = {each["keypoint"]: str(each["name"]) for each in state["keypoints"]}
+    return names[number] if number is not None else ""
+
+
+def take_proposed(session: Session) -> str:
+    """Mark the proposed keypoint where the photo has it, or skip it; returns its name."""
+    state, pixels = page_state(session, 0), chair_pixels()
+    proposed = state["model"]["proposed"]
+    name = named(state, proposed)
+    if name in pixels:
+        perform(session, 0, {"do": "take", "keypoint": proposed, "uv": pixels[name]})
+    else:
+        perform(session, 0, {"do": "skip"})
+    return name
+
+
+def test_keypoints_far_from_each_other_are_proposed_first(photo: Path) -> None:
+    session = opened(photo)
+    names = [take_proposed(session) for _ in range(4)]
+    assert len(set(names)) == 4
+    assert any("back, top" in name for name in names)
+    assert any("leg" in name or "base" in name for name in names)
+
+
+def test_skipped_keypoints_are_proposed_again_after_all_others(photo: Path) -> None:
+    session = opened(photo)
+    count = len(page_state(session, 0)["keypoints"])
+    first = page_state(session, 0)["model"]["proposed"]
+    seen = set()
+    for _ in range(count):
+        seen.add(page_state(session, 0)["model"]["proposed"])
+        perform(session, 0, {"do": "skip"})
+    assert len(seen) == count
+    assert page_state(session, 0)["model"]["proposed"] is None
+    perform(session, 0, {"do": "skip"})
+    assert page_state(session, 0)["model"]["proposed"] == first
+    assert not photo.with_suffix(".json").exists()
+
+
+def test_a_click_on_the_skeleton_replaces_the_pending_keypoint(photo: Path) -> None:
+    session = opened(photo)
+    perform(session, 0, {"do": "place_keypoint", "keypoint": 3})
+    perform(session, 0, {"do": "place_keypoint", "keypoint": 5})
+    perform(session, 0, {"do": "place_uv", "uv": [10, 20]})
+    (pair,) = page_state(session, 0)["pairs"]
+    assert (pair["keypoint"], pair["uv"]) == (5, (10, 20))
+    missed = {"do": "pick", "origin": [0, 0, -3], "direction": [0, 0, 1]}
+    assert "one of the keypoints" in perform(session, 0, missed).message
+    with pytest.raises(CadalignError, match="keeps its name"):
+        perform(session, 0, {"do": "rename", "pair": pair["pair"], "name": "foot"})
+
+
+def test_two_pairs_need_two_more(photo: Path) -> None:
+    session = opened(photo, ready=True)
+    for keypoint, uv in ((0, [10, 20]), (1, [300, 20])):
+        perform(session, 0, {"do": "take", "keypoint": keypoint, "uv": uv})
+    message = page_state(session, 0)["alignment"]["message"]
+    assert message == "2 more pairs to the first alignment."
+
+
+def test_four_clicks_align_and_the_rest_is_taken_and_reopened(
+    photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = opened(photo, ready=True, focal=900.0)
+    while len(page_state(session, 0)["pairs"]) < 4:
+        take_proposed(session)
+    state = page_state(session, 0)
+    drawn = state["alignment"]
+    assert drawn["status"] == "done"
+    assert drawn["lines"]
+    used = {pair["keypoint"] for pair in state["pairs"]}
+    estimated = {each["keypoint"]: each["uv"] for each in drawn["unmarked"]}
+    assert not used & set(estimated)
+    assert state["model"]["proposed"] in estimated
+    ring, uv = next(iter(estimated.items()))
+    perform(session, 0, {"do": "take", "keypoint": ring, "uv": uv})
+    with pytest.raises(CadalignError, match="already used"):
+        perform(session, 0, {"do": "take", "keypoint": ring, "uv": uv})
+    while len(page_state(session, 0)["pairs"]) < 9:
+        take_proposed(session)
+
+    observation = Observation.load(photo.with_suffix(".json"))
+    assert observation.model is None
+    assert json.loads(photo.with_suffix(".json").read_text())["shape"] == "chair"
+    assert not list(photo.parent.glob("*.keypoints.json"))
+    again = page_state(opened(photo), 0)["pairs"]
+    before = page_state(session, 0)["pairs"]
+    for pairs in (again, before):
+        pairs.sort(key=lambda pair: pair["keypoint"])
+    assert [(p["keypoint"], list(p["uv"])) for p in again] == [
+        (p["keypoint"], list(p["uv"])) for p in before
+    ]
+    out = ["--json", "--no-picture", "--out", str(photo.parent / "fit")]
+    assert main(["fit", str(photo.with_suffix(".json")), *out]) == 0
+    fitted = json.loads(capsys.readouterr().out)
+    live = session.live(session.photos[0]).result
+    assert live is not None
+    np.testing.assert_allclose(
+        Alignment.from_dict(fitted["alignment"]).matrix, live.alignment.matrix, rtol=1e-5, atol=1e-7
+    )
+
+
+def test_another_category_keeps_pairs_of_equal_names(photo: Path) -> None:
+    session = opened(photo)
+    state = page_state(session, 0)
+    assert "sofa" not in state["model"]["categories"]
+    ids = {each["name"]: each["keypoint"] for each in state["keypoints"]}
+    table = ShapeModel.pretrained("table").names
+    shared = [name for name in ids if name in table]
+    own = [name for name in ids if name not in table][:2]
+    for name in (*shared, *own):
+        uv = [10.0 + ids[name], 20.0]
+        perform(session, 0, {"do": "take", "keypoint": ids[name], "uv": uv})
+    outcome = perform(session, 0, {"do": "category", "name": "table"})
+    assert f"{len(shared)} of {len(shared) + len(own)} pairs stay" in outcome.message
+    state = page_state(session, 0)
+    assert state["model"]["key"] == "table"
+    assert not state["can_undo"]
+    kept = {pair["name"] for pair in state["pairs"] if pair["name"]}
+    assert kept == set(shared)
+    halves = [pair for pair in state["pairs"] if pair["keypoint"] is None]
+    assert sorted(pair["uv"][0] for pair in halves) == sorted(10.0 + ids[name] for name in own)
+    # The observation remembers its category.
+    again = page_state(opened(photo), 0)
+    assert again["model"]["key"] == "table"
+    assert len(again["pairs"]) == len(state["pairs"])
+    with pytest.raises(CadalignError, match="unknown category 'sofa'"):
+        perform(session, 0, {"do": "category", "name": "sofa"})
+
+
+def test_shapes_from_files_are_not_exchanged(photo: Path) -> None:
+    path = photo.parent / "own.shape"
+    ShapeModel.pretrained("mug").save(path)
+    session = opened(photo, str(path))
+    assert not page_state(session, 0)["model"]["categories"]
+    with pytest.raises(CadalignError, match="that come with cadalign"):
+        perform(session, 0, {"do": "category", "name": "table"})
+
+
+def test_input_without_model_or_shape_is_refused(
+    photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, said in (
+        ([], "neither a model nor a shape is given; give the CAD model, or a category"),
+        (["--shape", "sofa"], "unknown shape 'sofa'"),
+        (["--shape", "chair", "--keypoints", "k.json"], "given without a model"),
+    ):
+        assert main(["annotate", str(photo), *arguments, "--no-open"]) == 2
+        assert said in capsys.readouterr().err
+    observation = photo.with_suffix(".json")
+    Observation(np.zeros((1, 3)), np.zeros((1, 2)), CAMERA, model=photo.parent / "chair.obj").save(
+        observation
+    )
+    with pytest.raises(CadalignError, match="belongs to the model"):
+        opened(photo)
+
+
+@pytest.mark.long
+def test_a_chair_from_nothing_to_an_exported_box(browser: Browser, photo: Path) -> None:
+    """Clicks alone: the proposed keypoints, then an estimated one is taken, another dragged."""
+    session, pixels = opened(photo, focal=900.0), chair_pixels()
+    session.warm_up()
+    with opened_page(browser, session, width=1200, height=800) as page:
+        status = page.get_by_role("status")
+        expect(status).to_contain_text("Click in the photo: ")
+        for _ in range(8):
+            state = page.evaluate("annotator.state")
+            name, count = named(state, state["model"]["proposed"]), len(state["pairs"])
+            if name in pixels:
+                page.mouse.click(*place_of_pixel(page, pixels[name]))
+                wait(page, f"annotator.idle && annotator.state.pairs.length === {count + 1}")
+            else:
+                page.keyboard.press("s")
+                old = state["model"]["proposed"]
+                wait(page, f"annotator.idle && annotator.state.model.proposed !== {old}")
+        wait(page, "annotator.state.alignment.status === 'done'")
+
+        state = page.evaluate("annotator.state")
+        rings = [
+            ring
+            for ring in state["alignment"]["unmarked"]
+            if ring["keypoint"] != state["model"]["proposed"]
+            and named(state, ring["keypoint"]) in pixels
+        ]
+        taken, dragged = rings[0], rings[-1]
+        page.mouse.click(*place_of_pixel(page, taken["uv"]))
+        count = len(state["pairs"])
+        wait(page, f"annotator.idle && annotator.state.pairs.length === {count + 1}")
+        pair = page.evaluate("annotator.state.pairs.at(-1)")
+        assert (pair["keypoint"], pair["uv"]) == (taken["keypoint"], taken["uv"])
+        now = page.evaluate("annotator.state.alignment.unmarked")
+        (start,) = (ring["uv"] for ring in now if ring["keypoint"] == dragged["keypoint"])
+        target = pixels[named(state, dragged["keypoint"])]
+        page.mouse.move(*place_of_pixel(page, start))
+        page.mouse.down()
+        page.mouse.move(*place_of_pixel(page, [target[0] + 9, target[1]]))
+        page.mouse.move(*place_of_pixel(page, target))
+        page.mouse.up()
+        wait(page, f"annotator.idle && annotator.state.pairs.length === {count + 2}")
+        pair = page.evaluate("annotator.state.pairs.at(-1)")
+        assert pair["keypoint"] == dragged["keypoint"]
+        np.testing.assert_allclose(pair["uv"], target, atol=1.5)
+    out = photo.parent / "chair.glb"
+    assert main(["fit", str(photo.with_suffix(".json")), "--out", str(photo.parent / "x")]) == 0
+    assert main(["export", str(photo.parent / "x"), "--to", str(out)]) == 0
+    assert out.stat().st_size > 0

@@ -49,7 +49,7 @@ def act(access: Access, body: str = UNDO, **options: str) -> int:
     return ask(access, "/act/0", method="POST", body=body, **(defaults | options))[0]
 
 
-PATHS = ["/", "/annotate.js", "/annotate.css", "/model", "/photo/0", "/state/0"]
+PATHS = ["/", "/annotate.js", "/annotate.css", "/model/0", "/photo/0", "/state/0"]
 
 
 @pytest.mark.long
@@ -67,7 +67,7 @@ def test_with_the_token_everything_is_served(access: Access, path: str) -> None:
 def test_the_model_is_served(original: Case) -> None:
     session = original.open(prepared=False)
     with served(session) as opened:
-        assert ask(opened, "/model")[::2] == (200, session.model.cad.display_bytes)
+        assert ask(opened, "/model/0")[::2] == (200, session.model.cad.display_bytes)
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/nowhere", "/?token=", "/?token=wrong"])

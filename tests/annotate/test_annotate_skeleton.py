@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, expect
 from support.annotating import opened_page, place_of_pixel, wait
 
-from cadalign import Alignment, Camera, CadalignError, ShapeModel
+from cadalign import Alignment, CadalignError, Camera, ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.page_state import page_state
@@ -33,7 +33,7 @@ def chair_pixels() -> dict[str, list[float]]:
     right = np.cross(ahead, [0, 1, 0])
     axes = np.stack([right / np.linalg.norm(right), np.cross(ahead, right), ahead])
     axes[1] /= np.linalg.norm(axes[1])
-    pose = Alignment(axes, -axes @ eye)
+    pose = Alignment(axes, -axes @ eye, np.ones(3))
     pixels = CAMERA.project(pose.apply(shape.mean[: len(shape.ids)]))
     rows = [row for part in LEGGED for row in range(part.start, part.stop)]
     return {shape.names[row]: pixels[row].tolist() for row in rows}
@@ -158,9 +158,9 @@ def test_four_clicks_align_and_the_rest_is_taken_and_reopened(
     fitted = json.loads(capsys.readouterr().out)
     live = session.live(session.photos[0]).result
     assert live is not None
-    np.testing.assert_allclose(
-        Alignment.from_dict(fitted["alignment"]).matrix, live.alignment.matrix, rtol=1e-5, atol=1e-7
-    )
+    found = Alignment.from_dict(fitted["alignment"])
+    np.testing.assert_allclose(found.translation, live.alignment.translation, rtol=1e-4)
+    np.testing.assert_allclose(found.rotation, live.alignment.rotation, atol=1e-4)
 
 
 def test_another_category_keeps_pairs_of_equal_names(photo: Path) -> None:
@@ -208,7 +208,7 @@ def test_input_without_model_or_shape_is_refused(
         (["--shape", "sofa"], "unknown shape 'sofa'"),
         (["--shape", "chair", "--keypoints", "k.json"], "given without a model"),
     ):
-        assert main(["annotate", str(photo), *arguments, "--no-open"]) == 2
+        assert main(["annotate", str(photo), *arguments, "--no-open"]) == 1
         assert said in capsys.readouterr().err
     observation = photo.with_suffix(".json")
     Observation(np.zeros((1, 3)), np.zeros((1, 2)), CAMERA, model=photo.parent / "chair.obj").save(

@@ -81,7 +81,8 @@ def place_keypoint(
     """Place a model half at a keypoint of the registry, preferably of the given pair."""
     state.model.registry[keypoint]  # raises InputError for an unknown keypoint
     pending = [each.number for each in state.marks.pairs if each.uv is None]
-    if state.model.is_skeleton and pending:  # another keypoint is chosen instead
+    lacks = any(each.keypoint is None for each in state.marks.pairs)
+    if state.model.is_skeleton and pending and not lacks:  # another keypoint is chosen instead
         state.record(state.marks.exchange_keypoint(pending[0], keypoint))
         return ActionOutcome(pending[0])
     marks, number = state.marks.place_keypoint(keypoint, pair)

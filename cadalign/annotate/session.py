@@ -119,8 +119,16 @@ class Annotation:
         rows = [row for row, number in enumerate(numbers) if number in self.marks.keypoints]
         done = self.marks.keypoints | self.skipped
         left = [row for row, number in enumerate(numbers) if number not in done]
-        row = next_row(learned.mean[: len(numbers)], rows, left, live.result)
-        return None if row is None else numbers[row]
+        # A part that was skipped and has no mark, such as an armrest, is likely absent.
+        part_of = {number: point.name.split(",")[0] for number, point in self.model.registry}
+        absent = {part_of[number] for number in self.skipped}
+        absent -= {part_of[number] for number in self.marks.keypoints}
+        likely = [row for row in left if part_of[numbers[row]] not in absent]
+        for group in (likely, left):
+            row = next_row(learned.mean[: len(numbers)], rows, group, live.result)
+            if row is not None:
+                return numbers[row]
+        return None
 
     @property
     def can_exchange(self) -> bool:

@@ -9,10 +9,6 @@ export class Panel {
     this.notes = h("ul", { class: "notes" });
     this.rows = h("ol", { class: "pairs" });
     this.title = h("h2", {}, "Pairs");
-    this.keypoints = h("select", {
-      "aria-label": "Keypoints of the model that are not marked",
-      onchange: () => handlers.act({ do: "place_keypoint", keypoint: Number(this.keypoints.value) }),
-    });
     this.root = h(
       "section",
       { class: "panel", "aria-label": "Results" },
@@ -26,7 +22,7 @@ export class Panel {
     this.showAlignment(state.alignment);
     this.showCategory(state.model);
     this.showEvidence(state);
-    this.showKeypoints(state.keypoints);
+    this.free = state.keypoints.filter(({ used }) => !used);
     this.showPairs(state, selected);
   }
 
@@ -96,12 +92,13 @@ export class Panel {
     this.also.textContent = alignment.also_used ? `Also used: ${alignment.also_used}` : "";
   }
 
-  /** The keypoints that can be marked, in a list that a person who knows their names chooses from. */
-  showKeypoints(keypoints) {
-    const free = keypoints.filter(({ used }) => !used);
-    const options = free.map(({ keypoint, name }) => h("option", { value: keypoint }, name));
-    this.keypoints.replaceChildren(h("option", { value: "" }, "choose a keypoint"), ...options);
-    this.hasKeypoints = free.length > 0;
+  /** The choice of a pair's keypoint, by name. */
+  choice(pair) {
+    const options = this.free.map(({ keypoint, name }) => h("option", { value: keypoint }, name));
+    const act = () => this.handlers.act({ do: "place_keypoint", keypoint: Number(choice.value), pair });
+    const label = "Keypoints of the model that are not marked";
+    const choice = h("select", { "aria-label": label, onchange: act }, h("option", { value: "" }, "choose a keypoint"), options);
+    return choice;
   }
 
   showPairs({ pairs, shape, model }, selected) {
@@ -137,7 +134,7 @@ export class Panel {
   }
 
   name({ pair, keypoint, name }) {
-    if (keypoint === null) return h("span", {}, "click the model", this.hasKeypoints && [" or ", this.keypoints]);
+    if (keypoint === null) return h("span", {}, "click the model", this.free.length > 0 && [" or ", this.choice(pair)]);
     if (this.isFixed) return h("span", { title: name }, name);
     return h("input", {
       value: name,

@@ -311,7 +311,7 @@ export class PhotoView {
     if (status !== "done") return;
     this.stroke(lines, "#35d0ff", 1.2);
     this.stroke(box, "#ff5a63", 2);
-    this.stroke(regions, UNCERTAIN, 1.2);
+    this.drawRegions(regions, unmarked);
     for (const each of unmarked) {
       const { keypoint, uv } = this.draggedRing?.keypoint === each.keypoint ? this.draggedRing : each;
       const { x, y } = this.toView(uv);
@@ -319,6 +319,16 @@ export class PhotoView {
       this.context.arc(x, y, 3.5, 0, 2 * Math.PI);
       strokeTwice(this.context, keypoint === this.state.model.proposed ? PROPOSED : UNCERTAIN, 1.8);
     }
+  }
+
+  /** Without a CAD model there are many regions: all but the proposed keypoint's are faint. */
+  drawRegions(regions, unmarked) {
+    const { is_skeleton: isSkeleton, proposed } = this.state.model;
+    const isClear = (_, row) => !isSkeleton || unmarked[row].keypoint === proposed;
+    this.context.globalAlpha = 0.3;
+    this.stroke(regions.filter((...each) => !isClear(...each)), UNCERTAIN, 0.8);
+    this.context.globalAlpha = 1;
+    this.stroke(regions.filter(isClear), isSkeleton ? PROPOSED : UNCERTAIN, 1.2);
   }
 
   /** Stroke paths, each given as u1, v1, u2, v2, ... in pixels. */

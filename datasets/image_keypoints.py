@@ -192,7 +192,7 @@ def join_keypoints(
     found : ImageKeypoints
     model : ModelKeypoints
     camera : Camera
-        The photo's camera; `Camera.without_focal` if its focal length is unknown.
+        The photo's camera; `Camera.drop_focal` if its focal length is unknown.
     image : Path, optional
         The photo.
     min_score : float
@@ -276,8 +276,8 @@ def observed_in(
         fix = "give the photo, or the camera"
         raise DataError("the photo's size is unknown", where=found.source, fix=fix)
     require_one_size(sizes, image)
-    camera = camera or Camera.without_focal(*next(iter(sizes.values())))
-    return replace(changes, camera=None).applied_to(
+    camera = camera or Camera.drop_focal(*next(iter(sizes.values())))
+    return replace(changes, camera=None).apply(
         join_keypoints(found, model, camera, image=image, **how)
     )
 

@@ -91,7 +91,7 @@ class ObservationFile:
         refuse_other_photo(stored.image, self.photo.path, where=self.path)
         self._warn_of_options(stored)
         with in_file(self.path), within("unfinished"):
-            unfinished = convert(stored.unfinished or {}, _Unfinished)
+            unfinished = convert(stored.draft or {}, _Unfinished)
         self.stored = stored if up_axis is None else replace(stored, up_axis=up_axis)
         mask = stored.evidence.mask
         marks = Marks(
@@ -177,7 +177,7 @@ class ObservationFile:
             fit_options=options,
             shape=self.shape.path,
             init=marks.start if len(pairs) < LEAST_JOINT_PAIRS else None,
-            unfinished={"pairs": halves} if halves else None,
+            draft={"pairs": halves} if halves else None,
         )
 
     def _half(self, pair: Pair) -> dict[str, Any]:

@@ -97,7 +97,7 @@ class ObservationFit:
         needs_xyz = None if self.shape is None and self.shape_sigma is None else self.shape is None
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
-        return changes.applied_to(seen, where)  # outside of `in_file`: errors name options
+        return changes.apply(seen, where)  # outside of `in_file`: errors name options
 
     def changed(self, seen: Observation) -> Observation:
         """Override the stored settings of an observation by the options that are set.

@@ -188,7 +188,7 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
         try:
             require_one_size(known, view.image)
         except DataError as error:
-            yield "camera", f"{error} (`Camera.resized`, `Camera.cropped`)"
+            yield "camera", f"{error} (`Camera.resize`, `Camera.crop`)"
 
 
 def plan_run(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:

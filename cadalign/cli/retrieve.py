@@ -203,7 +203,7 @@ class LibraryShow:
 def _describe(library: Library) -> str:
     counts = Counter(category for category, _ in library.keys)
     listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
-    without = len(library) - library.with_mesh
+    without = len(library) - library.mesh_count
     text = f"{len(library)} models: {listed}" + (f"; {without} without a mesh" if without else "")
     return f"{text}\nKeypoints: {', '.join(library.names)}" if library.names else text
 

@@ -239,7 +239,7 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
     pose = turned_poses(pose, facing.lens_from_camera)
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
-    return Alignment.from_packed(pose), kept, int(iterations), int(hypotheses), float(score)
+    return Alignment.from_vector(pose), kept, int(iterations), int(hypotheses), float(score)
 
 
 def _confidence(scores: npt.ArrayLike | None, count: int) -> FloatArray:

@@ -261,7 +261,7 @@ def linearise(
     count, matrices = len(points), whitening_matrices(seen.whitening)
     rays = perspective(points @ pose.linear.T + pose.translation)
     errors = (matrices @ (rays - seen.rays)[:, :, None])[:, :, 0]
-    by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :POSE_UNKNOWNS]
+    by_pose = matrices @ ray_derivatives(points, pose.vector)[:, :, :POSE_UNKNOWNS]
     weights = loss_weights((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     roots = np.sqrt(weights)[:, None]
     by_pose *= roots[..., None]

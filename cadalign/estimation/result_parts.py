@@ -154,7 +154,7 @@ def alternatives_of(
     return tuple(
         Alternative(pose, ratio, camera, points)
         for pose, ratio, camera in list(zip(poses, ratios, cameras, strict=True))[1:]
-        if ratio >= LEAST_LIKELIHOOD and np.isfinite(pose.packed).all()
+        if ratio >= LEAST_LIKELIHOOD and np.isfinite(pose.vector).all()
     )
 
 

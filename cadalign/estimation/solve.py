@@ -160,7 +160,7 @@ def keypoints_of_solution(
         "points_3d": points,
         "residuals": solutions.residuals,
         "inliers": inliers,
-        "alignment": Alignment.from_packed(solutions.poses[0, 0]),
+        "alignment": Alignment.from_vector(solutions.poses[0, 0]),
         "camera": problems.camera,
         "options": options,
         "sigma": float(cast(float, options.sigma)) if is_one else None,
@@ -172,7 +172,7 @@ def keypoints_of_solution(
         fitted["fisher_covariance"] = covariance
         fitted["cost"] = solutions.costs.item(0)
     if minima > 1:
-        poses = [Alignment.from_packed(pose) for pose in solutions.poses[0, :minima]]
+        poses = [Alignment.from_vector(pose) for pose in solutions.poses[0, :minima]]
         cameras, costs = [problems.camera] * minima, solutions.costs[0, :minima].tolist()
         fitted["alternatives"] = alternatives_of(points, poses, cameras, costs)
     effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}

@@ -52,7 +52,7 @@ class Camera(Calibration):
         Kind of lens. A fisheye may see points beside and behind the camera. Its focal length must
         be known.
     focal_known : bool
-        False if the focal lengths are placeholders; see `without_focal`.
+        False if the focal lengths are placeholders; see `drop_focal`.
 
     Raises
     ------
@@ -70,7 +70,7 @@ class Camera(Calibration):
     [[633.66, 319.5]]
     """
 
-    def turned(self, rotation: npt.ArrayLike) -> Camera:
+    def rotate(self, rotation: npt.ArrayLike) -> Camera:
         """Turn the frame of a camera with a wide lens about the camera centre.
 
         ``rotation`` (3, 3) maps this camera's frame to the new one. The image and the lens do not
@@ -84,7 +84,7 @@ class Camera(Calibration):
         Examples
         --------
         >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5, lens="fisheye")
-        >>> aside = camera.turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # z is the former x
+        >>> aside = camera.rotate([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # z is the former x
         >>> bool(np.allclose(aside.project([[0, 0, 1]]), camera.project([[1, 0, 0]])))
         True
         """
@@ -95,7 +95,7 @@ class Camera(Calibration):
 
     @property
     def lens_from_camera(self) -> FloatArray:
-        """Rotation (3, 3) from the camera's frame to the lens's frame; see `turned`."""
+        """Rotation (3, 3) from the camera's frame to the lens's frame; see `rotate`."""
         return np.array(self.turn).reshape(3, 3) if self.turn else np.eye(3)
 
     @property
@@ -299,7 +299,7 @@ def faced(camera: Camera, points_2d: FloatArray) -> Camera:
     axis = _facing_axis(rays[valid]) if valid.any() else np.array([0.0, 0.0, 1.0])
     across = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0], axis)
     across /= np.linalg.norm(across)
-    return camera.turned([across, np.cross(axis, across), axis])
+    return camera.rotate([across, np.cross(axis, across), axis])
 
 
 def _facing_axis(rays: FloatArray) -> FloatArray:

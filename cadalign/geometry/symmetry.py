@@ -215,7 +215,7 @@ class Symmetry:
             result = Alignment(turned, alignment.translation + shift, scale)
         return Equal(result, motion, free, self.center)
 
-    def nearest_turned(self, alignment: Alignment, rotation: FloatArray) -> Alignment:
+    def nearest_pose(self, alignment: Alignment, rotation: FloatArray) -> Alignment:
         """Apply the group to the stretched object; return the alignment nearest to ``rotation``.
 
         Unlike `canonical`, this assumes that the stretched object has the symmetry, not the model:

@@ -140,8 +140,8 @@ class Observation(ObservedImage):
         Name of the object.
     up_axis : {"y", "x", "z"} or None
         The model's axis that points up, as for `cadalign.Model`.
-    unfinished : mapping, optional
-        Annotator state that is not usable as evidence yet.
+    draft : mapping, optional
+        Annotator state that is not usable as evidence yet; the field ``unfinished`` of the file.
     """
 
     model: Path | None = None
@@ -153,7 +153,7 @@ class Observation(ObservedImage):
     init: Alignment | None = field(default=None, kw_only=True)
     object_name: str | None = field(default=None, kw_only=True)
     up_axis: Literal["x", "y", "z"] | None = field(default="y", kw_only=True)
-    unfinished: Mapping[str, Any] | None = field(default=None, kw_only=True)
+    draft: Mapping[str, Any] | None = field(default=None, kw_only=True)
 
     @property
     def views(self) -> tuple[ObservedImage, ...]:
@@ -231,7 +231,7 @@ class Observation(ObservedImage):
             init=init,
             object_name=read.object,
             up_axis=read.up_axis,
-            unfinished=read.unfinished,
+            draft=read.unfinished,
         )
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
@@ -248,7 +248,7 @@ class Observation(ObservedImage):
             "size": self.size and msgspec.to_builtins(self.size),
             "symmetry": self.symmetry and self.symmetry.to_dict(),
             "init": self.init and self.init.to_dict(),
-            "unfinished": self.unfinished,
+            "unfinished": self.draft,
             "fit": self.fit_options,
         }
         data |= {name: value for name, value in further.items() if value}
@@ -271,7 +271,7 @@ class ObservationChanges:
         """Read the camera, or None; ``size`` is the photo's, for a file with only a matrix."""
         return None if self.camera is None else read_camera(self.camera, size=size)
 
-    def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
+    def apply(self, observation: Observation, where: str | None = None) -> Observation:
         """Replace an observation's camera and focal length; ``where`` is the observation's file.
 
         Raises InputError if a camera is given and the observation has several views.
@@ -287,8 +287,8 @@ class ObservationChanges:
             return changed
         # The new focal length replaces the file's options about it.
         kept = {key: given for key, given in changed.fit_options.items() if "focal" not in key}
-        others = [replace(view, camera=view.camera.with_focal(focal)) for view in changed.others]
-        camera = changed.camera.with_focal(focal)
+        others = [replace(view, camera=view.camera.replace_focal(focal)) for view in changed.others]
+        camera = changed.camera.replace_focal(focal)
         return replace(changed, camera=camera, others=tuple(others), fit_options=kept)
 
 

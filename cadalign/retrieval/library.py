@@ -125,7 +125,7 @@ class Library(ModelTable):
         return np.array([known[plain_name(name)] for name in names], dtype=np.int64)
 
     @property
-    def with_mesh(self) -> int:
+    def mesh_count(self) -> int:
         """Number of models that have a mesh."""
         return len(self) - self.meshes.count(None)
 

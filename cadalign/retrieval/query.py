@@ -48,7 +48,7 @@ class ObservationRetrieval:
         """Convert a parsed observation and apply changes; its keypoints need no xyz."""
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
-        return changes.applied_to(seen, where)
+        return changes.apply(seen, where)
 
     def with_ids(self, seen: Observation, where: str) -> Observation:
         """Add the library's semantic ids by keypoint names, unless the observation has ids.

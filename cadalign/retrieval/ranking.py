@@ -307,7 +307,7 @@ def make_matches(
     for place, candidate in enumerate(ranking.candidates[: options.top].tolist()):
         points_3d, rows = shared_keypoints(candidates, observed, candidate)
         model = table.model(int(candidates.models[candidate]))
-        found = Alignment.from_packed(ranking.poses[place])
+        found = Alignment.from_vector(ranking.poses[place])
         alignment = turned_alignment(found, observed.facing.lens_from_camera)
         pixels, camera = observed.points_2d[rows], observed.camera
         residuals = camera.project(alignment.apply(points_3d)) - pixels

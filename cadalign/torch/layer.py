@@ -70,7 +70,7 @@ class FitTask:
             raise InputError(what, where="camera", fix="undistort keypoints and camera first")
         if not all(each.focal_known for each in self.cameras):
             what = "the focal length is unknown"
-            raise InputError(what, where="camera", fix="give it: camera.with_focal(...)")
+            raise InputError(what, where="camera", fix="give it: camera.replace_focal(...)")
 
 
 class _FirstOrder(torch.autograd.Function):
@@ -226,7 +226,7 @@ def _search(
     def fit_alone(b: int) -> None:
         part = replace(options, sigma=sigmas[b, present[b]])
         with suppress(CadalignError):
-            poses[b] = fit_once(problems[b], part, None, None, 0.0).alignment.packed
+            poses[b] = fit_once(problems[b], part, None, None, 0.0).alignment.vector
             valid[b] = True
 
     @np.errstate(all="ignore")  # NumPy keeps this state per thread

@@ -109,7 +109,7 @@ def test_keypoints_without_ids_are_the_same_at_the_same_point(tmp_path: Path) ->
     np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-6)
 
 
-def without_focal(path: Path) -> Path:
+def drop_focal(path: Path) -> Path:
     """Remove the focal lengths from the cameras of a file."""
     data = json.loads(path.read_text())
     for image in data.get("views", [data]):
@@ -121,9 +121,9 @@ def without_focal(path: Path) -> Path:
 def test_unknown_focal_length_of_two_views_is_estimated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = without_focal(write(tmp_path, observed(0.0), observed(25.0)))
+    path = drop_focal(write(tmp_path, observed(0.0), observed(25.0)))
     assert main(["fit", str(path)]) == 0
-    unknown = Camera.without_focal(640, 480)
+    unknown = Camera.drop_focal(640, 480)
     views = [View(unknown, observed(angle).points_2d) for angle in (0.0, 25.0)]
     expected = align(Model(points_3d=POINTS), views, focal="estimate")
     found = result_in(tmp_path)
@@ -140,7 +140,7 @@ def test_prior_of_the_photo_is_used(tmp_path: Path, capsys: pytest.CaptureFixtur
     exif[0x8769] = {0xA405: 28}  # focal length in 35 mm film
     Image.new("RGB", (640, 480)).save(photo, exif=exif)
     images = [replace(observed(turn), image=photo) for turn in (0.0, 25.0)]
-    path = without_focal(write(tmp_path, *images))
+    path = drop_focal(write(tmp_path, *images))
     assert main(["fit", str(path), "--no-picture"]) == 0
     assert "+- 5 %, the photo's EXIF data" in capsys.readouterr().err
     path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": {"focal_prior": "usual"}}))

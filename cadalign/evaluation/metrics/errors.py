@@ -95,7 +95,7 @@ def estimate_errors(
     turned = [k for k, symmetry in enumerate(symmetries) if not symmetry.is_trivial]
     if turned:
         nearest = [
-            symmetries[k].nearest_turned(instances[k].gt, estimates[k].rotation) for k in turned
+            symmetries[k].nearest_pose(instances[k].gt, estimates[k].rotation) for k in turned
         ]
         some = Alignments(*(array[turned] for array in est))
         aware = _pose_errors(some, Alignments.of(nearest), bounds[turned], diagonals[turned])

@@ -267,7 +267,7 @@ def test_points_that_are_no_keypoints_end_no_box() -> None:
     views = [seen(keypoints(12), truth_of((1, 1, 1)), np.eye(4))]
     evidence = plain_evidence(prior, views)
     modes, mean = evidence.shape.modes, evidence.shape.mean
-    pose = truth_of((1, 1, 1)).packed[None, :12]
+    pose = truth_of((1, 1, 1)).vector[None, :12]
     state = State(pose, np.zeros(0), np.zeros(3), np.zeros(len(modes)), np.zeros_like(mean))
     margins = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
     farthest = int(mean[2:12, 0].argmax()) + 2

@@ -29,7 +29,7 @@ from cadalign.errors import DegenerateError, NoConsensusError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.metrics import rotation_error
 
-UNKNOWN = Camera.without_focal(640, 480)
+UNKNOWN = Camera.drop_focal(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 
 
@@ -43,7 +43,7 @@ def whitened(
     problem: SimulatedProblem, alignment: Alignment, camera: Camera, step: np.ndarray
 ) -> np.ndarray:
     """Residuals after a step of the 9 unknowns, in the documented order."""
-    seen = camera.with_focal(camera.fx * np.exp(step[8]))
+    seen = camera.replace_focal(camera.fx * np.exp(step[8]))
     return seen.project(moved(alignment, step).apply(problem.points_3d)) - problem.points_2d
 
 
@@ -255,7 +255,7 @@ def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
         problem_of(seed, points=12, camera=Camera.from_fov(width, 480, fov_x=40.0))
         for seed, width in enumerate((640, 1280))
     ]
-    cameras = [Camera.without_focal(p.camera.width, 480) for p in problems]
+    cameras = [Camera.drop_focal(p.camera.width, 480) for p in problems]
     points = [p.points_3d for p in problems], [p.points_2d for p in problems]
     batch = fit_batch(*points, cameras, focal="estimate")
     for b, camera in enumerate(cameras):

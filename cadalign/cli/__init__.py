@@ -6,7 +6,7 @@ import gc
 import logging
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
@@ -14,6 +14,12 @@ from operator import or_
 from typing import Annotated, Any
 
 import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
 from cadalign import __version__
 from cadalign.cli.common import UsageError
@@ -102,7 +108,10 @@ def _parse(arguments: list[str]) -> Any:
         command = class_of(name)
         about = cleandoc(str(command.__doc__))
         prog = f"cadalign {name}"
-        return tyro.cli(command, prog=prog, description=about, args=rest, config=config)
+        rules = _help_rules()
+        return tyro.cli(
+            command, prog=prog, description=about, args=rest, config=config, registry=rules
+        )
     stubs = [
         Annotated[_CommandStub, tyro.conf.subcommand(name, description=summary)]
         for name, (_, summary) in COMMANDS.items()
@@ -116,6 +125,34 @@ def _parse(arguments: list[str]) -> Any:
         args=arguments,
         config=config,
     )
+
+
+def _help_rules() -> ConstructorRegistry:
+    """Make rules that unwrap the lines of options' help and omit hints at defaults without value."""
+    registry, inner = ConstructorRegistry(), False
+
+    @registry.struct_rule
+    def describe(info: StructTypeInfo) -> StructConstructorSpec | None:
+        nonlocal inner
+        if inner or not is_dataclass(info.type):
+            return None
+        inner = True  # tyro's own rule, not this one
+        spec: Any = ConstructorRegistry.get_struct_spec(info)
+        inner = False
+        return replace(spec, fields=tuple(map(_describe, spec.fields)))
+
+    return registry
+
+
+def _describe(field: StructFieldSpec) -> StructFieldSpec:
+    def help_of(text: Any = field.helptext) -> str | None:
+        text = text() if callable(text) else text
+        return text and " ".join(text.split())
+
+    kind: Any = field.type
+    if field.default is None or field.default is False or field.default == ():
+        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
+    return replace(field, helptext=help_of, type=kind)
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,7 @@ def _parse(arguments: list[str]) -> Any:
 
 
 def _help_rules() -> ConstructorRegistry:
-    """Make rules that unwrap the lines of options' help and omit hints at defaults without value."""
+    """Make rules that join the lines of options' help and omit hints such as (default: None)."""
     registry, inner = ConstructorRegistry(), False
 
     @registry.struct_rule
@@ -139,7 +139,8 @@ def _help_rules() -> ConstructorRegistry:
         inner = True  # tyro's own rule, not this one
         spec: Any = ConstructorRegistry.get_struct_spec(info)
         inner = False
-        return replace(spec, fields=tuple(map(_describe, spec.fields)))
+        found: StructConstructorSpec = replace(spec, fields=tuple(map(_describe, spec.fields)))
+        return found
 
     return registry
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from functools import reduce
 from importlib import import_module
@@ -75,7 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given == ["--version"]:
         sys.stdout.write(f"cadalign {__version__}\n")
         return 0
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.addFilter(drop_repeats())
+    logging.basicConfig(format="%(levelname)s: %(message)s", handlers=[handler])
     # Imports create a million permanent objects. Rarer collections save 6 % of a start.
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
     try:
@@ -92,6 +94,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:  # the reader of the output has closed it
         return 0
+
+
+def drop_repeats() -> Callable[[logging.LogRecord], bool]:
+    """Make a filter that passes each text once: commands read some files several times."""
+    texts = set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        before = len(texts)
+        texts.add(record.getMessage())
+        return len(texts) > before
+
+    return is_new
 
 
 def class_of(name: str) -> Any:

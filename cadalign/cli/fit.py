@@ -35,8 +35,9 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
     observation file. Prints the alignment and how well each piece of evidence agrees with it.
     Writes fit.json and one picture per view: overlay.png, overlay_1.png and so on.
 
-    Several observations are aligned as a run. It writes results.parquet and results.csv, with a row
-    per observation, and report.html. A killed run continues when the same command is started again.
+    Several observations, or a detector's file even of one object, are aligned as a run. Instead of
+    fit.json it writes results.parquet and results.csv, with a row per observation, and report.html.
+    A killed run continues when the same command is started again.
 
     Exit codes of a run: 0 all aligned, 3 some failed, 1 all failed or the input was refused, 2
     wrong command line.

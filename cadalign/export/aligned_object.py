@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -131,8 +131,9 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     path = as_path(path)
     name = path.suffix.lower().removeprefix(".")
     if name not in FORMATS:
-        fix = f"give one that ends in {', '.join(f'.{each}' for each in FORMATS)}"
-        raise InputError("the name does not tell the format", where=printable(path), fix=fix)
+        fix = f"the formats are {', '.join(f'.{each}' for each in FORMATS)}"
+        what = f"the ending {quote(path.suffix)} is not an export format"
+        raise InputError(what, where=printable(path), fix=fix)
     return FORMATS[name]
 
 

@@ -334,7 +334,9 @@ def read_camera(path: str | os.PathLike[str], *, size: tuple[int, int] | None = 
             numbers = np.array(read_text(path).replace(",", " ").split(), dtype=float)
             form = {"matrix": numbers.reshape(3, 3)}
         except ValueError:
-            raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
+            is_list = path.name == "cameras.txt"
+            what = "COLMAP's list of cameras, not one" if is_list else "not a calibration matrix"
+            raise DataError(what, where=str(path), fix=CAMERA_FIX) from None
     if isinstance(form, dict) and "matrix" in form and not {"width", "height"} <= set(form):
         if size is None:
             what = "the file has only a matrix, and the size of the image is unknown"

@@ -64,6 +64,7 @@ def test_gravity_and_size_are_used_as_by_align(
     names = [each.name for each in expected.evidence]
     assert names == ["views[0].points_2d", "views[0].up", "size"]
     assert all(f"  evidence     {each}\n" in f"{expected}\n" for each in expected.evidence)
+    assert str(expected.evidence[-1]) == "size: sets the unit of lengths"
 
 
 @pytest.mark.slow
@@ -196,13 +197,14 @@ def test_mask_is_drawn_and_an_inverted_one_named(
     assert (np.abs(picture[..., ::-1].astype(int) - CONTOUR_COLOR).max(axis=2) < 40).sum() > 100
 
 
-def test_mask_alone_is_an_observation(tmp_path: Path) -> None:
+def test_mask_alone_is_an_observation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = truth_of((1.0, 0.7, 1.5))
     write_box(tmp_path, truth)
     nothing, evidence = np.empty((0, 3)), ImageEvidence(mask=tmp_path / "mask.png")
     image = ObservedImage(nothing, nothing[:, :2], CAMERA, evidence=evidence)
     path = write(tmp_path, image, model=tmp_path / "box.obj")
     assert main(["fit", str(path), "--no-picture"]) == 0
+    assert "  evidence     views[0].mask: rms " in capsys.readouterr().out
     found = result_in(tmp_path).alignment
     shown, expected = (
         cast_geometry(Scene(load_mesh(tmp_path / "box.obj")), CAMERA, pose).mask

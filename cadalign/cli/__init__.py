@@ -24,7 +24,7 @@ from tyro.constructors import (
 from cadalign import __version__
 from cadalign.cli.common import UsageError
 from cadalign.errors import CadalignError
-from cadalign.io.files import keeping
+from cadalign.io.files import protect_inputs
 
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
 COMMANDS = {  # module and class, and the first sentence of the help
@@ -81,7 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Imports create a million permanent objects. Rarer collections save 6 % of a start.
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
     try:
-        with keeping(()):  # protects the models and textures that are read from being overwritten
+        with protect_inputs(
+            ()
+        ):  # protects the models and textures that are read from being overwritten
             return int(_parse(given).run())
     except UsageError as error:
         sys.stderr.write(f"cadalign: {error}\n")

@@ -192,7 +192,7 @@ class Lenses:
     prior: PriorOption = None
 
     @classmethod
-    def of(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
+    def from_views(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
         """The views' lenses; only focal lengths of views with evidence are estimated."""
         cameras = tuple(view.camera for view in views)
         if focal == "known":

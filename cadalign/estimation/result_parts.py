@@ -301,7 +301,7 @@ def join_or(clauses: Sequence[str]) -> str:
     return f"{', '.join(some)} or {last}" if some else last
 
 
-def quickly(kind: type[T], fields: dict[str, Any]) -> T:
+def create_unchecked(kind: type[T], fields: dict[str, Any]) -> T:
     """Create a frozen dataclass without its slow constructor and checks."""
     made = object.__new__(kind)
     made.__dict__.update(fields)

@@ -13,7 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
-from cadalign.io.documents import in_file, parse_json
+from cadalign.io.documents import name_file, parse_json
 from cadalign.io.files import as_path
 from cadalign.solvers.constants import POSE_SIZE
 
@@ -199,5 +199,5 @@ class Results(Sequence[Result | CadalignError]):
 
 
 def _read_result(texts: Any, row: int, where: str) -> Result:
-    with in_file(where):
+    with name_file(where):
         return Result.from_dict(parse_json(texts[row].as_py(), "result"))

@@ -15,7 +15,7 @@ from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import as_path, keeping, made_folder, printable, refuse_nul
+from cadalign.io.files import as_path, create_folder, printable, protect_inputs, refuse_nul
 from cadalign.io.meshes.files import write_mesh
 
 _SAME = 1e-6
@@ -163,7 +163,7 @@ def export_object(path: str | os.PathLike[str], exported: AlignedObject) -> Path
     path = as_path(path)
     refuse_nul(path)
     form = format_of(path)
-    made_folder(path.parent)
-    with keeping([*exported.sources, *(view.image for view in exported.views)]):
+    create_folder(path.parent)
+    with protect_inputs([*exported.sources, *(view.image for view in exported.views)]):
         form.write(path, exported)
     return path

@@ -287,7 +287,7 @@ _ROUNDS = 64
 _RESULT_UNKNOWNS = 10  # of a result's covariance, focal length included
 
 
-def faced(camera: Camera, points_2d: FloatArray) -> Camera:
+def face_pixels(camera: Camera, points_2d: FloatArray) -> Camera:
     """Turn a camera with a wide lens so that its z axis faces pixels (n, 2), or most of them.
 
     A perspective or already turned camera is returned unchanged. ``lens_from_camera`` of the
@@ -327,7 +327,7 @@ def _cone_axis(rays: FloatArray) -> FloatArray:
 
 
 def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
-    """Normalised coordinates (n, 2) of pixels (n, 2) in the frame of a camera that was `faced`.
+    """Normalised coordinates (n, 2) of pixels (n, 2) in the frame of a camera of `face_pixels`.
 
     ``clips`` moves rays more than 85 degrees off the z axis to 85 degrees; otherwise they raise
     InputError. So do pixels at which the lens model cannot be inverted.
@@ -345,13 +345,13 @@ def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) ->
     return perspective(rays)
 
 
-def turned_alignment(alignment: Alignment, rotation: FloatArray) -> Alignment:
+def rotate_alignment(alignment: Alignment, rotation: FloatArray) -> Alignment:
     """Transform an alignment by the ``rotation`` (3, 3) from its camera frame to a new one."""
     turned = rotation @ alignment.rotation, rotation @ alignment.translation
     return Alignment(*turned, alignment.scale, is_valid=True)
 
 
-def turned_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
+def rotate_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
     """Transform packed poses (..., 15) by the ``rotation`` (3, 3) to a new camera frame."""
     turned = packed.copy()
     columns = packed[..., :9].reshape(*packed.shape[:-1], 3, 3)
@@ -360,7 +360,7 @@ def turned_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
     return turned
 
 
-def turned_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
+def rotate_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
     """Transform a pose's covariance (..., m, m), m >= 6, by the ``rotation`` (3, 3)."""
     turn = np.eye(covariance.shape[-1])
     turn[:3, :3] = turn[3:6, 3:6] = rotation

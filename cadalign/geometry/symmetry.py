@@ -55,7 +55,7 @@ class Equal:
     center: FloatArray
     """Fixed point (3,) of all symmetries, in the model's frame."""
 
-    def relabelled(self, points: FloatArray) -> FloatArray:
+    def map_points(self, points: FloatArray) -> FloatArray:
         """Model points (n, 3) of the other alignment in this alignment's model frame; (n, 3)."""
         return np.asarray((points - self.motion[:3, 3]) @ self.motion[:3, :3])
 

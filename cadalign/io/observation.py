@@ -26,9 +26,9 @@ from cadalign.io.documents import (
     Positive,
     Text,
     convert,
-    in_file,
+    name_file,
+    name_part,
     read_json,
-    within,
     written_path,
 )
 from cadalign.io.evidence import (
@@ -196,7 +196,7 @@ class Observation(ObservedImage):
         """
         path = as_path(path)
         data = read_json(path, OBSERVATION)
-        with in_file(path):
+        with name_file(path):
             return cls.from_dict(data, folder=path.parent, needs_xyz=needs_xyz)
 
     @classmethod
@@ -212,13 +212,13 @@ class Observation(ObservedImage):
         needs_xyz = read.shape is None if needs_xyz is None else needs_xyz
         images = []
         for number, each in enumerate(fields):
-            with nullcontext() if each is read else within(f"views[{number}]"):
+            with nullcontext() if each is read else name_part(f"views[{number}]"):
                 images.append(read_image_fields(each, needs_xyz=needs_xyz))
         first, *others = images
         options = msgspec.to_builtins(read.fit)
         if first.not_found and isinstance(options.get("sigma"), list):
             options["sigma"] = np.delete(options["sigma"], first.not_found).tolist()
-        with within("init"):
+        with name_part("init"):
             init = None if read.init is None else Alignment.from_dict(read.init)
         return cls(
             **vars(first),
@@ -342,5 +342,5 @@ def read_camera(path: str | os.PathLike[str], *, size: tuple[int, int] | None = 
             what = "the file has only a matrix, and the size of the image is unknown"
             raise DataError(what, where=str(path), fix="give the photo, or add width and height")
         form |= {"width": size[0], "height": size[1]}
-    with in_file(path):
+    with name_file(path):
         return Camera.from_dict(form)

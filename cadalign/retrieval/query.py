@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import DataError
-from cadalign.io.documents import in_file
+from cadalign.io.documents import name_file
 from cadalign.io.files import once_per_file
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.retrieval.options import RetrievalOptions
@@ -34,7 +34,7 @@ class ObservationRetrieval:
     """Standard deviation of the keypoints [px]; by default the observation's, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
 
-    def opened(self) -> tuple[Library, ShapeModel | None]:
+    def open_files(self) -> tuple[Library, ShapeModel | None]:
         """Read the library and the shape model, cached; raises DataError if unreadable."""
         if self.shape is None:
             return _library(self.library), None
@@ -46,7 +46,7 @@ class ObservationRetrieval:
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
     ) -> Observation:
         """Convert a parsed observation and apply changes; its keypoints need no xyz."""
-        with in_file(where):
+        with name_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
         return changes.apply(seen, where)
 
@@ -58,20 +58,20 @@ class ObservationRetrieval:
         """
         if seen.ids is not None and len(seen.points_2d):
             return seen
-        with in_file(where):
+        with name_file(where):
             if not len(seen.points_2d):
                 raise DataError("there are no keypoints")
             if seen.names is None:
                 fix = "give each its id or name in the library"
                 raise DataError("the keypoints have no semantic_id and no name", fix=fix)
-            return replace(seen, ids=self.opened()[0].ids_of(seen.names))
+            return replace(seen, ids=self.open_files()[0].ids_of(seen.names))
 
     def retrieve(self, seen: Observation, where: str, *, workers: int = -1) -> list[Match]:
         """Rank the library's models by an observation with ids; see `Library.retrieve`."""
         if seen.others:
             message = "%s: models are ranked by the first of its %d photos alone"
             logger.warning(message, where, len(seen.views))
-        library, shape = self.opened()
+        library, shape = self.open_files()
         assert seen.ids is not None
         own_sigma = 1.0 if seen.sigma is None else seen.sigma
         sigma = own_sigma if self.sigma is None else self.sigma

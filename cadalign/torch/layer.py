@@ -23,7 +23,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.problems import Problems, in_threads, join_problems, rays_of
+from cadalign.estimation.problems import Problems, join_problems, rays_of, run_in_threads
 from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import OK
@@ -240,5 +240,5 @@ def _search(
         solved = first + np.flatnonzero(found.statuses == OK)
         poses[solved], valid[solved] = found.poses[solved - first, 0], True
 
-    in_threads(run, len(points), task.workers)
+    run_in_threads(run, len(points), task.workers)
     return poses, valid

@@ -249,7 +249,11 @@ def test_the_rig_frame_is_that_of_the_cameras() -> None:
 
 def plain_evidence(prior: ShapePrior, views: list[View]) -> Evidence:
     """Evidence for the first component, with known cameras without turns."""
-    given = {"options": FitOptions(), "lenses": Lenses.of(views, "known", None), "noise": 1.0}
+    given = {
+        "options": FitOptions(),
+        "lenses": Lenses.from_views(views, "known", None),
+        "noise": 1.0,
+    }
     turns = [np.eye(3)] * len(views)
     return evidence_of(prior, prior.components[0], views, None, turns=turns, **given)
 

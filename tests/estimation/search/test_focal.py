@@ -234,7 +234,7 @@ def test_prior_that_the_keypoints_contradict_is_said_so() -> None:
 
 def test_prior_of_usual_lenses_is_the_default_and_is_told() -> None:
     problem = problem_of(2, points=20, noise_px=1.0, camera=LONG, depth=(6.0, 9.0))
-    usual = FocalPrior.of_usual_lenses(640, 480)
+    usual = FocalPrior.from_size(640, 480)
     result = fit(problem.points_3d, problem.points_2d, UNKNOWN, focal="estimate")
     assert result.focal_prior == usual
     assert f"(prior: {usual})" in str(result)
@@ -261,7 +261,7 @@ def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
     for b, camera in enumerate(cameras):
         single = fit(problems[b].points_3d, problems[b].points_2d, camera, focal="estimate")
         assert batch.focal_length[b] == single.camera.fx
-        assert single.focal_prior == FocalPrior.of_usual_lenses(camera.width, 480)
+        assert single.focal_prior == FocalPrior.from_size(camera.width, 480)
 
 
 @pytest.mark.long

@@ -14,7 +14,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.canvas import ByteImage, LinearArray, bytes_from_linear
-from cadalign.render.posed import PosedScene, Rectangle, draw_in_threads, pose_scene
+from cadalign.render.posed_scene import PosedScene, Rectangle, draw_in_threads, pose_scene
 from cadalign.render.scene import Frame, Geometry, Scene, check_image_size
 from cadalign.render.surface import Studio
 

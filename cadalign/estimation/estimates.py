@@ -23,7 +23,7 @@ from cadalign.estimation.symmetry import (
 )
 from cadalign.estimation.uncertainty.residuals import loss_weights, whitening_matrices
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
+from cadalign.geometry.camera import Camera, rotate_alignment, rotate_covariance
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import by_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Equal, Symmetry
@@ -184,8 +184,8 @@ def undo_turns(estimate: Estimate, problem: Problem) -> Estimate:
         return estimate
     wide = [problem.given[number].camera for number in numbers]
     return estimate._replace(
-        poses=tuple(map(turned_alignment, estimate.poses, turns)),
-        covariances=tuple(map(turned_covariance, estimate.covariances, turns)),
+        poses=tuple(map(rotate_alignment, estimate.poses, turns)),
+        covariances=tuple(map(rotate_covariance, estimate.covariances, turns)),
         of_seen=first @ estimate.of_seen @ first.T,
         cameras=tuple(
             given if given.is_wide else own
@@ -239,7 +239,7 @@ def _transform(estimate: Estimate, best: Equal) -> Estimate:
         equal = replace(best, alignment=pose if poses else best.alignment)
         poses.append(equal.alignment)
         covariances.append(remove_free_turns(transform_covariance(covariance, given, equal), equal))
-    points = best.relabelled(estimate.points)
+    points = best.map_points(estimate.points)
     entries = np.abs(turn)
     if (np.minimum(entries, 1 - entries) > _ALONG_AXES).any():
         points[-2:] = estimate.points[-2:]  # a turned box would not be axis-aligned
@@ -261,7 +261,7 @@ def linearise(
     count, matrices = len(points), whitening_matrices(seen.whitening)
     rays = perspective(points @ pose.linear.T + pose.translation)
     errors = (matrices @ (rays - seen.rays)[:, :, None])[:, :, 0]
-    by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :POSE_UNKNOWNS]
+    by_pose = matrices @ ray_derivatives(points, pose.vector)[:, :, :POSE_UNKNOWNS]
     weights = loss_weights((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     roots = np.sqrt(weights)[:, None]
     by_pose *= roots[..., None]

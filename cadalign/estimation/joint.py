@@ -48,8 +48,8 @@ from cadalign.estimation.result_parts import (
     ViewResult,
     Warnings,
     alternatives_of,
+    create_unchecked,
     keypoint_summary,
-    quickly,
 )
 from cadalign.estimation.search import Minimum, search
 from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
@@ -269,7 +269,7 @@ def add_diagnosis(
     causes = partial(_causes, result, diagnosis, views, ransac)
     known = vars(result.posterior) | {"causes": causes, "stated": result.warnings}
     known.pop("warnings")
-    return replace(result, posterior=quickly(DiagnosedPosterior, known))
+    return replace(result, posterior=create_unchecked(DiagnosedPosterior, known))
 
 
 def _causes(

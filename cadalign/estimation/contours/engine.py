@@ -180,7 +180,7 @@ def sources_of(views: Sequence[View], minimum: Minimum, *, is_exact: bool) -> li
     found: list[Source] = []
     for image, (view, camera) in enumerate(zip(views, minimum.lenses.cameras, strict=True)):
         if view.mask_image is not None:
-            found.append(MaskSource.of(image, view, camera, is_exact=is_exact))
+            found.append(MaskSource.from_view(image, view, camera, is_exact=is_exact))
         elif view.image is not None:
             photo = photo_of(camera, cast(ByteImage, view.image))
             found.append(PhotoSource(image, view.number, camera, is_exact, photo))

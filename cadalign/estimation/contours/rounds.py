@@ -77,7 +77,7 @@ class OutlineProblem(NamedTuple):
         for source, own in zip(self.sources, self.own_of(state), strict=True):
             camera, ratio = source.camera, ratios[source.image]
             if ratio != 1.0:
-                camera = camera.with_focal(camera.fx * ratio)
+                camera = camera.replace_focal(camera.fx * ratio)
             right, down = (REGISTRATION * own[1:]).tolist()
             camera = replace(camera, cx=camera.cx + right, cy=camera.cy + down)
             found.append(Sight(posed.caster, camera, poses[source.image]))

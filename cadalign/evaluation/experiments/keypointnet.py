@@ -111,7 +111,7 @@ class KeypointTasks(Sequence[KeypointTask]):
         if not self.keys:
             raise DataError("there are no models to evaluate", where=str(dataset.root))
         self._first = lru_cache(maxsize=4)(
-            lambda key: KeypointTask.of_model(dataset, *key, hull=options.visibility == "hull")
+            lambda key: KeypointTask.from_model(dataset, *key, hull=options.visibility == "hull")
         )
 
     def __len__(self) -> int:
@@ -221,7 +221,7 @@ def keypointnet_benchmark(
 ) -> Benchmark:
     """The benchmark of the chosen methods on views of models."""
     setting = KeypointViews(options, drawn_in)
-    found = Benchmark.of(setting, options.methods, metrics=options.metrics)
+    found = Benchmark.from_methods(setting, options.methods, metrics=options.metrics)
     batched = frozenset(each.name for each in found.methods if not each.has_statistics)
     return replace(found, batched=batched)
 

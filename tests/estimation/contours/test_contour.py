@@ -177,7 +177,7 @@ def test_an_uneven_mask_that_is_met_in_parts_alone_is_doubted() -> None:
     mask[30:70, 20:80] = True
     camera = Camera(100, 100, 100, 100, 49.5, 49.5)
     view = View(camera, [[30, 40], [60, 40], [50, 60]], mask=mask)
-    source = MaskSource.of(0, view, camera)
+    source = MaskSource.from_view(0, view, camera)
     uneven = OutlineSupport(share=0.75, agreeing=100, rms=1.8, rms_sigmas=1.0)
     assert "only 75 % of its contour meets" in (source.doubt(uneven) or "")
     for support in (uneven._replace(rms=0.1), uneven._replace(share=0.97)):

@@ -50,7 +50,7 @@ class ObservationRetrieval:
             seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
         return changes.apply(seen, where)
 
-    def with_ids(self, seen: Observation, where: str) -> Observation:
+    def resolve_ids(self, seen: Observation, where: str) -> Observation:
         """Add the library's semantic ids by keypoint names, unless the observation has ids.
 
         Raises DataError if there are no keypoints, or if they have neither ids nor names;

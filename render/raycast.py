@@ -276,7 +276,9 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> LinearArra
 
     def look(part: slice) -> None:
         directions = _sky_directions(normal[hit][part], tile[part]).reshape(-1, 3)
-        blocked = posed.blocked(np.repeat(points[part], _RAYS, axis=0), directions, reach=reach)
+        blocked = posed.occlusion_mask(
+            np.repeat(points[part], _RAYS, axis=0), directions, reach=reach
+        )
         rows_of, columns_of = inside[part].T
         sky[rows_of, columns_of] = 1 - blocked.reshape(-1, _RAYS).mean(axis=1)
 

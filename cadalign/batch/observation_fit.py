@@ -100,7 +100,7 @@ class ObservationFit:
             seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
         return changes.apply(seen, where)  # outside of `name_file`: errors name options
 
-    def changed(self, seen: Observation) -> Observation:
+    def override(self, seen: Observation) -> Observation:
         """Override the stored settings of an observation by the options that are set.
 
         Raises InputError if an option has no effect with a shape or with further evidence.
@@ -135,7 +135,7 @@ class ObservationFit:
                 raise InputError(what, where=name, fix=fix)
 
     def fit(self, seen: Observation, where: str, *, note: Note = lambda text: None) -> Result:
-        """Align an observation that `changed` has returned; ``where`` names it in messages.
+        """Align an observation that `override` has returned; ``where`` names it in messages.
 
         ``note`` is called with the keypoints that are left out, and the prior on a focal length.
         Raises CadalignError if an option or the observation is invalid, or if no alignment exists.

@@ -42,7 +42,7 @@ class RetrieveRunOptions(FitRunOptions):
         return self.estimate.open_files()[0].keypoints
 
     def estimate_of(self, seen: Observation, where: str) -> Estimate:
-        seen = self.estimate.with_ids(seen, where)
+        seen = self.estimate.resolve_ids(seen, where)
         matches = self.estimate.retrieve(seen, where, workers=1)
         best = matches[0]
         cells = {

@@ -99,7 +99,7 @@ class FitRunOptions(ExperimentOptions):
 
     def estimate_of(self, seen: Observation, where: str) -> Estimate:
         """Align an observation; raises CadalignError if that fails."""
-        seen = self.estimate.changed(seen)
+        seen = self.estimate.override(seen)
         return seen, self.estimate.fit(seen, where), {}
 
 

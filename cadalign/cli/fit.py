@@ -69,7 +69,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
                 return run_command(self, options, done="aligned")
             how.check()
             seen = how.read(data, str(path), folder=path.parent, changes=self.changes)
-            seen = how.changed(seen)
+            seen = how.override(seen)
             with show_status("fitting"):
                 result = how.fit(seen, str(path), note=say)
         self._write(path, seen, result)

@@ -84,7 +84,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 options = RetrieveRunOptions(estimate=how, **inputs_of(self))
                 return run_command(self, options, done="retrieved")
             query = how.read(data, str(path), folder=path.parent, changes=self.changes)
-            return self._retrieve(how.with_ids(query, str(path)), path, how)
+            return self._retrieve(how.resolve_ids(query, str(path)), path, how)
 
     def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
         """Retrieve the models of one observation; returns the exit code."""

@@ -156,16 +156,16 @@ class Estimate(NamedTuple):
     """An estimate: points (m, 3), the box's corners last, poses, and covariances.
 
     Poses, covariances (9, 9) and cameras are given for each view that takes part, in the frames of
-    the given cameras. ``of_points`` (m, 3, 3) are covariances of the points in the model's frame,
-    ``of_seen`` in the first camera's frame, including the pose.
+    the given cameras. ``points_covariance`` (m, 3, 3) are covariances of the points in the model's
+    frame, ``points_cam_covariance`` in the first camera's frame, including the pose.
     """
 
     points: FloatArray
     scale: FloatArray
     poses: tuple[Alignment, ...]
     covariances: tuple[FloatArray, ...]
-    of_points: FloatArray
-    of_seen: FloatArray
+    points_covariance: FloatArray
+    points_cam_covariance: FloatArray
     likelihood: float = 1.0
     cameras: tuple[Camera, ...] = ()
     is_optimum: bool = False
@@ -186,7 +186,7 @@ def undo_turns(estimate: Estimate, problem: Problem) -> Estimate:
     return estimate._replace(
         poses=tuple(map(rotate_alignment, estimate.poses, turns)),
         covariances=tuple(map(rotate_covariance, estimate.covariances, turns)),
-        of_seen=first @ estimate.of_seen @ first.T,
+        points_cam_covariance=first @ estimate.points_cam_covariance @ first.T,
         cameras=tuple(
             given if given.is_wide else own
             for given, own in zip(wide, estimate.cameras, strict=True)
@@ -250,7 +250,7 @@ def _transform(estimate: Estimate, best: Equal) -> Estimate:
         scale=scale,
         poses=tuple(poses),
         covariances=tuple(covariances),
-        of_points=turn.T @ estimate.of_points @ turn,
+        points_covariance=turn.T @ estimate.points_covariance @ turn,
     )
 
 

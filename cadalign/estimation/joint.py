@@ -113,8 +113,8 @@ def result_of(
     pose, points = best.poses[0], best.points[:-2]
     places = np.array([each.points * each.scale for each in estimates])
     seen = np.array([each.poses[0].apply(each.points) for each in estimates])
-    of_points = second_moments(estimates, [each.of_points for each in estimates], places)
-    of_seen = second_moments(estimates, [each.of_seen for each in estimates], seen)
+    of_points = second_moments(estimates, [each.points_covariance for each in estimates], places)
+    of_seen = second_moments(estimates, [each.points_cam_covariance for each in estimates], seen)
     of_views, summaries = [], list(evidence)
     known = dict(zip((views[k].camera for k in numbers), best.cameras, strict=True))
     for number, view in enumerate(views):

@@ -242,7 +242,7 @@ class Lenses:
             for camera, group in zip(self.cameras, self.groups, strict=True)
         ]
 
-    def at(self, log_focals: FloatArray) -> Lenses:
+    def replace_focals(self, log_focals: FloatArray) -> Lenses:
         """Lenses with new references at log focal lengths (F,), relative to the old ones."""
         return replace(self, cameras=tuple(self.cameras_at(log_focals)))
 

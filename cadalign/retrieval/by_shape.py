@@ -226,7 +226,7 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     stacked[:, -BOX_ROWS:] = table.bounds[table.rows_of(category)]
     has = ~np.isnan(stacked[:, :-BOX_ROWS, 0])
     extent = float(np.linalg.norm(np.ptp(shape.mean, axis=0)))
-    prior = gaussians_of(shape).widened(_FLOOR * extent)
+    prior = gaussians_of(shape).widen(_FLOOR * extent)
     flat = _complete(stacked.reshape(len(stacked), -1), prior)
     weights, full = _weights(stacked.shape[1]), flat.reshape(stacked.shape)
     centres = weights @ full
@@ -243,7 +243,7 @@ def _complete(values: FloatArray, prior: Gaussians) -> FloatArray:
     logs = np.array([log_likelihoods(vectors, part) for part in parts])
     shares = np.exp(logs - np.logaddexp.reduce(logs, axis=0))
     pairs = zip(shares, parts, strict=True)
-    return np.asarray(sum(share[:, None] * vectors.completed(part) for share, part in pairs))
+    return np.asarray(sum(share[:, None] * vectors.complete(part) for share, part in pairs))
 
 
 def _deviation(values: FloatArray, prior: Gaussians) -> float:

@@ -64,7 +64,7 @@ class ObservationRetrieval:
             seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
         return changes.apply(seen, where)
 
-    def with_ids(self, seen: Observation, where: str) -> Observation:
+    def resolve_ids(self, seen: Observation, where: str) -> Observation:
         """Add the library's semantic ids by keypoint names, unless the observation has ids.
 
         With a shape, names and ids are the shape's.

@@ -140,7 +140,7 @@ def atlas_of(mesh: Mesh, eye: float) -> Atlas:
         columns, rows = np.minimum((high - low) // cell + 2, _CELLS + 1).astype(int)
         x, y = low[:, None] + cell * np.arange(_CELLS + 1)
         grid = np.stack(np.meshgrid(x[:columns], y[:rows]), axis=-1).reshape(-1, 2)
-        covered = caster.covered(middle - far * direction, (grid / far) @ base + direction)
+        covered = caster.hit_mask(middle - far * direction, (grid / far) @ base + direction)
         if covered.sum() >= _LEAST_CELLS:
             image = covered.reshape(rows, columns).astype(np.float32)
             views.append(_whiten(image, low + base @ middle, cell))
@@ -227,7 +227,7 @@ class CentredMask(NamedTuple):
     def overlap(self, caster: RayCaster, pose: Alignment) -> float:
         """Intersection over union of the mask and the silhouette at a pose in this view."""
         origin, model_from_ray = model_rays(pose)
-        seen = caster.covered(origin, self.rays @ model_from_ray.T) & self.is_seen
+        seen = caster.hit_mask(origin, self.rays @ model_from_ray.T) & self.is_seen
         common = float(self.inside[seen].sum())
         return common / (float(self.inside.sum()) + int(seen.sum()) - common)
 

@@ -158,7 +158,7 @@ def test_the_exit_nearest_to_each_sample_is_its_rim(
     contour = Contour(points, np.tile([1.0, 0.0], (count, 1)), np.zeros(count, dtype=int))
     rims = find_rims(cast(Sight, sight), contour, reach)
     steps = np.linspace(-reach, reach, 2 * int(min(np.ceil(reach / 1.5), 24)) + 1)
-    covered = sight.covers(contour.at(steps[:, None] + np.zeros(count)))
+    covered = sight.covers(contour.offset_points(steps[:, None] + np.zeros(count)))
     for start, column, found, offset in zip(
         starts, covered.T, rims.found, rims.offset, strict=True
     ):

@@ -50,8 +50,9 @@ class SessionOptions:
     """The model's up axis, for its view and for gravity; by default the observation file's axis, or
     y."""
     shape: Path | None = None
-    """Shape file of `cadalign shape learn`: estimate the object's own shape within its category.
-    Only keypoints with a semantic id or name of the shape count."""
+    """Category of a shape that comes with cadalign, such as chair, or shape file: estimate the
+    object's own shape within its category. Only keypoints with a semantic id or name of the shape
+    count."""
 
 
 @contextmanager

@@ -49,8 +49,9 @@ class ObservationFit:
     robust: bool = False
     """Find outliers among the keypoints by RANSAC, and fit only the inliers."""
     shape: Path | None = None
-    """Shape file of `cadalign shape learn`: estimate the object's own shape within its category,
-    instead of a stretch. Keypoints need the shape's semantic ids or names, but no xyz."""
+    """Category of a shape that comes with cadalign, such as chair, or shape file: estimate the
+    object's own shape within its category, instead of a stretch. Keypoints need the shape's
+    semantic ids or names, but no xyz."""
     shape_sigma: float | None = None
     """Estimate the object's own shape as a deviation from the stretched model, with this standard
     deviation of each keypoint's position [model units]."""
@@ -319,21 +320,26 @@ def views_of(
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
-    """Return the ids or names of an image's keypoints in a learned shape; see `views_of`."""
+    """Return the shape's ids of an image's keypoints, by their names if the shape has all of them.
+
+    `views_of` describes the errors.
+    """
     if not len(image.points_2d):
         return ()
-    named = isinstance(shape.ids[0], str)
-    field, kind = ("name", "names") if named else ("semantic_id", "semantic ids")
-    given = image.names if named else image.ids
+    of_shape = shape.names or (shape.ids if isinstance(shape.ids[0], str) else ())
+    by_name = image.names is not None and (image.ids is None or {*image.names} <= {*of_shape})
+    field = "name" if of_shape and (by_name or of_shape is shape.ids) else "semantic_id"
+    given = image.names if field == "name" else image.ids
     if given is None:
+        kinds = "names" if of_shape is shape.ids else "semantic ids"
+        kinds += " or names" if shape.names else ""
         raise InputError(
             f"the keypoints have no {field}",
             where="keypoints",
-            fix=f"the shape of {shape.category} identifies its keypoints by their {kind}",
+            fix=f"the shape of {shape.category} identifies its keypoints by their {kinds}",
         )
-    ids = tuple(each if named else int(each) for each in given)
-    shape.rows(ids, where=f"keypoints.{field}")
-    return ids
+    rows = shape.rows(given, where=f"keypoints.{field}")
+    return tuple(shape.ids[row] for row in rows)
 
 
 def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:

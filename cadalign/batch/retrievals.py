@@ -35,7 +35,8 @@ class RetrieveRunOptions(FitRunOptions):
     @property
     def files(self) -> tuple[Path | None, ...]:
         named = self.changes.camera, self.detector.model
-        return *named, self.estimate.library, self.estimate.shape
+        own = self.estimate
+        return *named, own.library, own.shape, own.keypoint_names
 
     def keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints

@@ -88,9 +88,13 @@ class FitRunOptions(ExperimentOptions):
 
         shape = open_shape(self.estimate.shape)
         named = isinstance(shape.ids[0], str)
-        pairs = zip(shape.ids, shape.components[0].mean.tolist(), strict=False)
+        names = shape.names or map(str, shape.ids)
+        rows = zip(names, shape.ids, shape.components[0].mean.tolist(), strict=False)
         return ModelKeypoints(
-            tuple(ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
+            tuple(
+                ModelKeypoint(name, tuple(xyz), None if named else int(label))
+                for name, label, xyz in rows
+            )
         )
 
     def estimate_of(self, seen: Observation, where: str) -> Estimate:

@@ -72,6 +72,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
             how = ObservationRetrieval(
                 library=self.library,
                 shape=self.shape,
+                keypoint_names=self.keypoint_names,
                 sigma=self.sigma,
                 ranking=RetrievalOptions(**vars(self.ranking)),
             )

@@ -13,6 +13,7 @@ from cadalign.cli.common import answer, group_of, make_folder_of, say, show_stat
 from cadalign.cli.options import name_flags
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
+from cadalign.shapes.pretrained import CATEGORIES
 
 if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel
@@ -64,7 +65,7 @@ class ShapeShow:
     """Describe the shape model of a file."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
-    """Shape file of `cadalign shape learn`."""
+    """Category of a shape that comes with cadalign, such as chair, or shape file."""
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
@@ -76,9 +77,9 @@ class ShapeShow:
 
 def _text(model: ShapeModel) -> str:
     training = model.training
-    models = "given" if training is None else f"learned from {len(training)} models"
+    models = "" if training is None else f", learned from {len(training)} models"
     lines = [
-        f"{model.category}: {len(model.ids)} keypoints, {models}; lengths in {model.unit}",
+        f"{model.category}: {len(model.ids)} keypoints{models}; lengths in {model.unit}",
         f"  up axis      {model.up_axis or 'unknown'}",
     ]
     for number, each in enumerate(model.components, start=1):
@@ -89,9 +90,24 @@ def _text(model: ShapeModel) -> str:
             f"the first {_MODES} hold {held:.0f} % of the variance; standard deviation of a "
             f"coordinate {sigma:.3g}, {each.residual_sigma:.2g} beyond the modes"
         )
-    return "\n".join(lines)
+    pairs = zip(model.ids, model.names, strict=False)
+    return "\n".join([*lines, *(f"  keypoint {label!s:>3}  {name}" for label, name in pairs)])
+
+
+@dataclass(frozen=True)
+class ShapeList:
+    """List the categories whose shapes come with cadalign."""
+
+    def run(self) -> int:
+        """Print a line for each category; returns the exit code."""
+        from cadalign.shapes.model import ShapeModel
+
+        for name in CATEGORIES:
+            answer(f"{name:<12}{len(ShapeModel.pretrained(name).ids):>3} keypoints")
+        return 0
 
 
 ShapeCommand = group_of(
-    "Learn and inspect shape models of categories.", {"learn": ShapeLearn, "show": ShapeShow}
+    "Learn, list and inspect shape models of categories.",
+    {"learn": ShapeLearn, "list": ShapeList, "show": ShapeShow},
 )

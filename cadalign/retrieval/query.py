@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cadalign.errors import DataError
-from cadalign.io.documents import in_file
+import numpy as np
+
+from cadalign.datasets.image_keypoints import plain_name, some_of
+from cadalign.errors import DataError, InputError, refuse_unused, unknown
+from cadalign.io.documents import convert, in_file, read_json
 from cadalign.io.files import once_per_file
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.retrieval.options import RetrievalOptions
@@ -20,6 +25,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("cadalign")
 
+_LEAST_KEYPOINTS = 3
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationRetrieval:
@@ -28,8 +35,12 @@ class ObservationRetrieval:
     library: Path
     """Library file of `cadalign library build`."""
     shape: Path | None = None
-    """File that `cadalign shape learn` wrote. With it, models of its category are ranked by their
-    similarity to the shape estimated from the keypoints, for objects not in the library."""
+    """Category of a shape that comes with cadalign, or shape file. With it, models of the category
+    are ranked by their similarity to the shape estimated from the keypoints, for objects not in the
+    library."""
+    keypoint_names: Path | None = None
+    """JSON table of the library's keypoint names, with the shape's name or id of each, if they
+    differ. With --shape only."""
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the observation's, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
@@ -37,10 +48,13 @@ class ObservationRetrieval:
     def opened(self) -> tuple[Library, ShapeModel | None]:
         """Read the library and the shape model, cached; raises DataError if unreadable."""
         if self.shape is None:
+            refuse_unused(self, ("keypoint_names",), "without a shape")
             return _library(self.library), None
         from cadalign.shapes.model import open_shape  # not needed for the commands' help
 
-        return _library(self.library), open_shape(self.shape)
+        library, shape = _library(self.library), open_shape(self.shape)
+        table = {} if self.keypoint_names is None else _read_table(self.keypoint_names)
+        return library, relabel(shape, library.names, table, where=str(self.library))
 
     def read(
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
@@ -53,9 +67,14 @@ class ObservationRetrieval:
     def with_ids(self, seen: Observation, where: str) -> Observation:
         """Add the library's semantic ids by keypoint names, unless the observation has ids.
 
+        With a shape, names and ids are the shape's.
+
         Raises DataError if there are no keypoints, or if they have neither ids nor names;
         InputError if the library lacks a name.
         """
+        library, shape = self.opened()
+        if shape is not None and seen.names and {*seen.names} <= {*shape.names}:
+            return replace(seen, ids=np.array(shape.ids)[shape.rows(seen.names)])
         if seen.ids is not None and len(seen.points_2d):
             return seen
         with in_file(where):
@@ -64,7 +83,7 @@ class ObservationRetrieval:
             if seen.names is None:
                 fix = "give each its id or name in the library"
                 raise DataError("the keypoints have no semantic_id and no name", fix=fix)
-            return replace(seen, ids=self.opened()[0].ids_of(seen.names))
+            return replace(seen, ids=library.ids_of(seen.names))
 
     def retrieve(self, seen: Observation, where: str, *, workers: int = -1) -> list[Match]:
         """Rank the library's models by an observation with ids; see `Library.retrieve`."""
@@ -90,3 +109,38 @@ def _library(path: Path) -> Library:
     from cadalign.retrieval.library import Library  # not needed for the commands' help
 
     return Library.open(path)
+
+
+def relabel(
+    shape: ShapeModel, names: Mapping[str, int], table: Mapping[str, str | int], *, where: str
+) -> ShapeModel:
+    """Give a shape's keypoints the ids that a library has for them.
+
+    ``names`` are the library's ids by name, ``table`` the shape's name or id of those that differ.
+    Without names of its own, the library has the shape's ids. Raises InputError if the table has an
+    unknown name, or fewer than 3 keypoints agree.
+    """
+    if unused := [name for name in table if name not in names]:
+        raise unknown("keypoint of the library", unused[0], names, where="keypoint_names")
+    if not names or not (table or shape.names):
+        return shape
+    row_of = {f"keypoint {label}": row for row, label in enumerate(shape.ids)}
+    row_of |= {plain_name(name): row for row, name in enumerate(shape.names)}
+    own: dict[int, int] = {}
+    for name, number in names.items():
+        if name in table:
+            own[int(shape.rows([table[name]], where="keypoint_names")[0])] = number
+        elif (row := row_of.get(plain_name(name))) is not None:
+            own.setdefault(row, number)
+    if len(own) < _LEAST_KEYPOINTS:
+        what = f"{len(own)} of its keypoints ({some_of(list(names))}) are {shape.category}'s"
+        fix = "give keypoint_names, a JSON table of its names with the shape's names"
+        raise InputError(what, where=where, fix=fix)
+    free = count(1 + max(names.values()))  # for keypoints that the library lacks
+    ids = tuple(own[row] if row in own else next(free) for row in range(len(shape.ids)))
+    return replace(shape, ids=ids)
+
+
+def _read_table(path: Path) -> dict[str, str | int]:
+    with in_file(path):
+        return convert(read_json(path), dict[str, str | int])

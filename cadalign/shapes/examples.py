@@ -202,12 +202,15 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
         _warn("of another size", len(rows), examples, whole[rows[0]], why)
 
 
-def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
-    """Warn of models that fit the others only if axes are exchanged or reversed."""
+def find_other_axes(rows: FloatArray) -> dict[int, FloatArray]:
+    """Find models that fit the others only if axes are exchanged or reversed.
+
+    ``rows`` are keypoints (N, m, 3), NaN if missing. Returns the axes (3, 3) that fit, by model.
+    """
     count = np.isfinite(rows[..., 0]).sum(axis=1)
     some = np.flatnonzero(count >= _LEAST_TO_TURN)
     if not len(some):
-        return
+        return {}
     normal = np.array([_unit(each) for each in rows[some]])
     is_seen = np.isfinite(normal[..., 0])
     place = np.full(rows.shape[1:], np.nan)
@@ -219,7 +222,11 @@ def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
         best = int(distances.argmin())
         if distances[0] > _ALIKE and distances[best] < _TURNED_RATIO * distances[0]:
             turned[int(row)] = _AXES[best].T
-    if turned:
+    return turned
+
+
+def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
+    if turned := find_other_axes(rows):
         odd, turn = next(iter(turned.items()))
         axes = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
         why = f"fit with ({', '.join(axes)}) as (x, y, z)"

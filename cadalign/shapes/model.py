@@ -6,14 +6,15 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
-from cadalign.errors import InputError, quote
-from cadalign.io.files import once_per_file
+from cadalign.errors import InputError, quote, unknown
+from cadalign.io.files import as_path, once_per_file
 from cadalign.shapes.basis import component_of_basis
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.outputs import read_shape, write_shape
@@ -28,6 +29,7 @@ from cadalign.shapes.parts import (
     check_ids,
     check_text,
 )
+from cadalign.shapes.pretrained import CATEGORIES, shape_path
 
 if TYPE_CHECKING:
     from cadalign.shapes.examples import Dataset, Example
@@ -88,6 +90,10 @@ class ShapeModel:
     the given keypoints."""
     few_keypoints: FewKeypoints | None = None
     """Decrease of the inflation for few given keypoints, calibrated likewise; None for none."""
+    names: tuple[str, ...] = ()
+    """Names of the keypoints, in the order of ``ids``, accepted wherever an id is; may be empty."""
+    lines: tuple[tuple[int, int], ...] = ()
+    """Rows of keypoints that belong together, such as the ends of a leg, for skeletons."""
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
@@ -117,6 +123,10 @@ class ShapeModel:
         object.__setattr__(self, "inflation", float(self.inflation))
         for name in ("category", "unit"):
             object.__setattr__(self, name, check_text(getattr(self, name), name))
+        if self.names and len(check_ids(self.names, "names")) != len(ids):
+            raise InputError(f"{len(self.names)} for {len(ids)} keypoints", where="names")
+        if not all(0 <= row < len(ids) for line in self.lines for row in line):
+            raise InputError(f"a row is not below {len(ids)}", where="lines")
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "components", tuple(self.components))
 
@@ -264,15 +274,45 @@ class ShapeModel:
         )
 
     @classmethod
+    def pretrained(cls, category: str) -> ShapeModel:
+        """Open the learned shape of a category that comes with the package.
+
+        The shapes are learned from KeypointNet's annotations. Lengths are in diagonals of the
+        bounding box, y points up and the front is at -z.
+
+        Parameters
+        ----------
+        category : str
+            airplane, bathtub, bed, bottle, cap, chair, guitar, helmet, knife, laptop, motorcycle,
+            mug, skateboard, table or vessel.
+
+        Raises
+        ------
+        InputError
+            If there is no such category; the message lists the categories.
+
+        Examples
+        --------
+        >>> chair = ShapeModel.pretrained("chair")
+        >>> chair.names[4], chair.rows(["seat, front right"]).tolist()
+        ('seat, front right', [4])
+        """
+        if category not in CATEGORIES:
+            raise unknown("category", category, CATEGORIES, where="category")
+        return read_shape(shape_path(Path(category)), cls)
+
+    @classmethod
     def open(cls, path: str | os.PathLike[str]) -> ShapeModel:
-        """Read a file written by `ShapeModel.save`.
+        """Read a file written by `ShapeModel.save`, or the pretrained shape of a category's name.
+
+        A file of that name is preferred, with a warning.
 
         Raises
         ------
         DataError
             If the file is missing, truncated, damaged, of another version, or of another format.
         """
-        return read_shape(path, cls)
+        return read_shape(shape_path(as_path(path)), cls)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the shape model to a file atomically; raises DataError on failure."""
@@ -296,21 +336,23 @@ class ShapeModel:
         return Gaussians(*map(np.array, zip(*parts, strict=True)))
 
     def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:
-        """Rows of the keypoints with the given ids, (n,) int.
+        """Rows of the keypoints with the given ids or names, (n,) int.
 
         Raises
         ------
         InputError
             If ids are unknown; the message names them.
         """
-        row_of = {label: row for row, label in enumerate(self.ids)}
+        row_of = {
+            label: row for labels in (self.names, self.ids) for row, label in enumerate(labels)
+        }
         wanted = [label.item() if isinstance(label, np.generic) else label for label in ids]
-        unknown = [label for label in wanted if label not in row_of]
-        if unknown:
+        missing = [label for label in wanted if label not in row_of]
+        if missing:
             raise InputError(
-                f"{self.category} has no keypoint {', '.join(quote(each) for each in unknown[:8])}",
+                f"{self.category} has no keypoint {', '.join(quote(each) for each in missing[:8])}",
                 where=where,
-                fix=f"known are {quote(list(self.ids))}",
+                fix=f"known are {quote(list(self.names or self.ids))}",
             )
         return np.array([row_of[label] for label in wanted], dtype=np.int64)
 

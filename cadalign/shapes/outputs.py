@@ -1,7 +1,8 @@
 """Files of shape models.
 
 A file is a sealed MessagePack document; see `cadalign.io.files` for the header. It holds the fields
-of `cadalign.ShapeModel` and its parts. Arrays are stored as shape and little-endian numbers.
+of `cadalign.ShapeModel` and its parts. Arrays are stored as shape and little-endian numbers,
+in single precision if that loses nothing.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _MAX_BYTES = 1 << 30  # enough for thousands of models with hundreds of keypoint
 
 
 class _Array(Document):
-    """An array of little-endian numbers in C order."""
+    """An array of little-endian numbers in C order, of 4 or 8 bytes each."""
 
     shape: Annotated[list[Count], Meta(max_length=3)]
     data: bytes
@@ -61,7 +62,8 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
 def _encode(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
-    little = value.astype(value.dtype.newbyteorder("<"))
+    single = value.astype("<f4")
+    little = single if np.array_equal(single, value, equal_nan=True) else value.astype("<f8")
     return _Array(list(value.shape), little.tobytes())
 
 
@@ -72,8 +74,9 @@ def _decode(kind: Any, value: Any) -> Any:
         array = msgspec.convert(value, _Array)
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from None  # msgspec adds the field's path
-    dtype = np.dtype(get_args(get_args(kind)[1])[0]).newbyteorder("<")
-    numbers = np.frombuffer(array.data, dtype=dtype) if array.data else np.empty(0, dtype=dtype)
-    if math.prod(array.shape) != len(numbers):
-        raise InputError(f"{len(numbers)} numbers do not fit the shape {array.shape}")
-    return numbers.reshape(array.shape).astype(dtype.newbyteorder("="))
+    size = math.prod(array.shape)
+    if len(array.data) not in (4 * size, 8 * size):
+        raise InputError(f"{len(array.data)} bytes do not fit the shape {array.shape}")
+    stored = "<f4" if len(array.data) == 4 * size else "<f8"
+    dtype = np.dtype(get_args(get_args(kind)[1])[0])
+    return np.frombuffer(array.data, dtype=stored).reshape(array.shape).astype(dtype)

@@ -1,0 +1,36 @@
+"""Learned shapes that come with the package: statistics of KeypointNet's annotations.
+
+`scripts/learn_shapes.py` writes the files; LICENSE.md has the notice of the data.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from cadalign.errors import unknown
+
+logger = logging.getLogger("cadalign")
+
+CATEGORIES = (
+    *("airplane", "bathtub", "bed", "bottle", "cap", "chair", "guitar", "helmet"),
+    *("knife", "laptop", "motorcycle", "mug", "skateboard", "table", "vessel"),
+)
+_FOLDER = Path(__file__).parent
+
+
+def shape_path(given: Path) -> Path:
+    """Return the shape file that a path means: itself, or the file of the category it names.
+
+    An existing file is preferred, with a warning. Paths in observation files are relative to a
+    folder, so only the name counts. Raises InputError for another name without a file.
+    """
+    if given.name not in CATEGORIES:
+        if not given.suffix and not given.exists():
+            raise unknown("shape", given.name, CATEGORIES, where=str(given))
+        return given
+    if given.is_file():
+        text = "%s: this file is used, not the shape of the category that comes with cadalign"
+        logger.warning(text, given)
+        return given
+    return _FOLDER / f"{given.name}.shape"

@@ -15,7 +15,7 @@ import tyro
 from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
 from cadalign.cli.options import name_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
-from cadalign.evaluation.experiments.keypointnet import DemoOptions
+from cadalign.evaluation.experiments.demo import DemoOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named

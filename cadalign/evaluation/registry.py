@@ -129,7 +129,7 @@ class Spec:
 # In the order of help texts and messages.
 _EXPERIMENTS = {
     "keypointnet": "cadalign.evaluation.experiments.keypointnet:SPEC",
-    "demo": "cadalign.evaluation.experiments.keypointnet:DEMO",
+    "demo": "cadalign.evaluation.experiments.demo:SPEC",
     "simulate": "cadalign.evaluation.experiments.simulation:SPEC",
     "correspondences": "cadalign.evaluation.experiments.correspondences:SPEC",
     "retrieval": "cadalign.evaluation.experiments.retrieval:SPEC",

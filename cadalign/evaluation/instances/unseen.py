@@ -195,7 +195,7 @@ class UnseenObjects(Setting):
         return ShapeEstimate(found, shape.mean[-2:], ids, shape.mean[:-2])
 
     def row(self, method: Method, seen: UnseenObject, estimate: ShapeEstimate) -> Row:
-        return _errors(estimate, seen)
+        return object_errors(estimate, seen)
 
     def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str:
         """The record has the box of the object's keypoints."""
@@ -212,7 +212,8 @@ class UnseenObjects(Setting):
         )
 
 
-def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
+def object_errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
+    """Errors of an estimate, and the levels of its regions that hold the truth."""
     est, gt = found.alignment, seen.gt
     known, rows = _shared(found, seen)
     own = found.points_3d[rows]

@@ -197,7 +197,7 @@ def as_one_or_each(value: Any, *, name: str, count: int, entries: str) -> FloatA
     return array
 
 
-def copied(value: Any) -> Any:
+def copy_argument(value: Any) -> Any:
     """Copy an array-like argument, which the caller may change later."""
     try:
         return deepcopy(value)

@@ -76,14 +76,14 @@ def require_kind(value: object, kind: type, where: str, *, fix: str | None = Non
         raise InputError(what, where=where, fix=fix)
 
 
-def unknown(
+def unknown_name(
     kind: str, value: object, known: Iterable[str], *, where: str | None = None
 ) -> InputError:
     """Make the error for an unknown value; it suggests the most similar known value.
 
     Examples
     --------
-    >>> print(unknown("style", "lnes", ["shaded", "lines"]))
+    >>> print(unknown_name("style", "lnes", ["shaded", "lines"]))
     style: unknown style 'lnes', did you mean 'lines'?; known are shaded, lines
     """
     from difflib import get_close_matches

@@ -40,7 +40,7 @@ class Alignments(NamedTuple):
     scale: FloatArray
 
     @classmethod
-    def of(cls, alignments: Sequence[Alignment]) -> Alignments:
+    def stack(cls, alignments: Sequence[Alignment]) -> Alignments:
         """Stack one or more alignments."""
         return cls(
             *(np.array([getattr(each, name) for each in alignments]) for name in cls._fields)

@@ -21,7 +21,15 @@ from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.datasets.image_keypoints import ImageKeypoints
 from cadalign.datasets.records import collect_error
 from cadalign.errors import DataError, InputError, quote
-from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
+from cadalign.io.documents import (
+    Count,
+    Finite,
+    ForeignDocument,
+    Text,
+    convert,
+    name_file,
+    read_json,
+)
 from cadalign.io.kinds import DETECTOR
 
 logger = logging.getLogger("cadalign")
@@ -93,12 +101,12 @@ def read_coco_keypoints(path: Path, problems: dict[str, DataError] | None) -> li
     `cadalign.datasets.read_image_keypoints` describes ``problems``.
     """
     data, objects = read_json(path, DETECTOR), []
-    with in_file(path):
+    with name_file(path):
         file = _parse_file(data)
         images, categories = _by_id(file.images, "images"), _by_id(file.categories, "categories")
     for row, entry in enumerate(file.annotations):
         where = f"[{row}]" if isinstance(data, list) else f"annotations[{row}]"
-        with collect_error(f"{path}: {where}", problems), in_file(path):
+        with collect_error(f"{path}: {where}", problems), name_file(path):
             found = _parse_annotation(entry, where, images, categories)
             if found is not None:
                 objects.append(replace(found, source=f"{path}: {where}"))

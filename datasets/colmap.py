@@ -25,8 +25,8 @@ from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
-from cadalign.io.documents import in_file
-from cadalign.io.files import as_path, damaged, read_text
+from cadalign.io.documents import name_file
+from cadalign.io.files import as_path, damage_error, read_text
 
 _FILES = ("cameras.txt", "images.txt", "points3D.txt")
 _SUBFOLDER = "sparse/0"
@@ -131,7 +131,7 @@ class Colmap(CorrespondenceSet):
     def _camera(self, camera_id: int, name: str) -> Camera:
         if camera_id not in self._cameras:
             raise self._mismatch(f"there is no camera {camera_id}", self._camera_file, name)
-        with in_file(f"{self._camera_file}, camera {camera_id}"):
+        with name_file(f"{self._camera_file}, camera {camera_id}"):
             return Camera.from_dict(self._cameras[camera_id])
 
     def _mismatch(self, what: str, file: Path, name: str) -> DataError:
@@ -187,10 +187,10 @@ def _read_images(path: Path) -> list[_Image]:
 def _parse_observations(observations: str | None, where: str) -> tuple[FloatArray, IntArray]:
     """Parse COLMAP's pixels (n, 2), with centres at (0.5, 0.5), and their point ids (n,)."""
     if observations is None:
-        raise damaged("the file ends before its observations", where)
+        raise damage_error("the file ends before its observations", where)
     words = observations.split()
     if len(words) % 3:
-        raise damaged(f"the observations have {len(words)} values, not three per point", where)
+        raise damage_error(f"the observations have {len(words)} values, not three per point", where)
     try:
         x, y = (np.array([float(word) for word in words[k::3]], dtype=float) for k in (0, 1))
         point_ids = np.array([int(word) for word in words[2::3]], dtype=np.int64)

@@ -13,7 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import check_pixels, unmeasured
+from cadalign.geometry.pixels import check_pixels, missing_pixels
 from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.kinds import PHOTO_ENDINGS
 from cadalign.io.observation import Observation, ObservationChanges
@@ -48,7 +48,7 @@ class ImageKeypoints:
     """The file and the place in it, for messages."""
     measured: BoolArray = field(init=False, repr=False)
     """Mask (k,) of the keypoints whose pixel is a measurement, whatever their score; see
-    `cadalign.geometry.pixels.unmeasured`."""
+    `cadalign.geometry.pixels.missing_pixels`."""
     segmentation: Any = field(default=None, kw_only=True)
     """The object's mask in COCO's form, unchecked; see
     `cadalign.datasets.coco.decode_segmentation`."""
@@ -63,7 +63,7 @@ class ImageKeypoints:
             fix = "give two finite numbers, or two NaN if it was not found"
             raise DataError(what, where=where, fix=fix)
         object.__setattr__(self, "points_2d", points)
-        measured = ~unmeasured(points, least=1)
+        measured = ~missing_pixels(points, least=1)
         for name in ("scores", "sigma"):
             if (value := getattr(self, name)) is None:
                 continue
@@ -96,7 +96,7 @@ class ImageKeypoints:
         """Mask (k,) of the keypoints that were found: with a measured pixel and a score over 0."""
         return self.measured if self.scores is None else np.asarray(self.scores > 0)
 
-    def is_of(self, photo: str) -> bool:
+    def matches_photo(self, photo: str) -> bool:
         """True if the image's name or id matches the photo's file name."""
         path = Path(photo)
         return self.image is not None and (
@@ -104,7 +104,7 @@ class ImageKeypoints:
         )
 
 
-def photo_in(folder: Path, image: str) -> Path | None:
+def find_photo(folder: Path, image: str) -> Path | None:
     """Find the photo of an image name or id in a folder, or None.
 
     Leading folders of the name may be missing. COCO's photos are named by ids of twelve digits.
@@ -138,7 +138,7 @@ def choose_object(
         If the image or object does not exist, or the choice is ambiguous.
     """
     images = list(dict.fromkeys(found.image for found in objects))
-    wanted = [found for found in objects if image is not None and found.is_of(image)]
+    wanted = [found for found in objects if image is not None and found.matches_photo(image)]
     shares = {found.image: _count_shared_parts(image, found.image) for found in wanted}
     wanted = [found for found in wanted if shares[found.image] == max(shares.values())]
     named = list(dict.fromkeys(found.image for found in wanted))
@@ -192,7 +192,7 @@ def join_keypoints(
     found : ImageKeypoints
     model : ModelKeypoints
     camera : Camera
-        The photo's camera; `Camera.without_focal` if its focal length is unknown.
+        The photo's camera; `Camera.drop_focal` if its focal length is unknown.
     image : Path, optional
         The photo.
     min_score : float
@@ -223,7 +223,7 @@ def join_keypoints(
     if unknown and not ignore_unknown:
         labels = found.names or found.ids or range(len(found))
         what = f"the model has no keypoint {labels[unknown[0]]!r}"
-        fix = f"it has {some_of(model.names)}; ignore_unknown leaves out unknown keypoints"
+        fix = f"it has {first_names(model.names)}; ignore_unknown leaves out unknown keypoints"
         raise DataError(what, where=found.source, fix=fix)
     pairs = [(row, place) for row in kept if (place := places[row]) is not None]
     first: dict[int, int] = {}
@@ -233,7 +233,7 @@ def join_keypoints(
             raise DataError(what, where=found.source, fix="leave one of them out")
     if not pairs:
         what = f"none of {len(found)} keypoints is found in the image and on the model"
-        raise DataError(what, where=found.source, fix=f"the model has {some_of(model.names)}")
+        raise DataError(what, where=found.source, fix=f"the model has {first_names(model.names)}")
     rows, columns = [row for row, _ in pairs], [place for _, place in pairs]
     ids = [model.ids[place] for place in columns]
     return Observation(
@@ -250,7 +250,7 @@ def join_keypoints(
     )
 
 
-def observed_in(
+def observe_keypoints(
     found: ImageKeypoints,
     model: ModelKeypoints,
     changes: ObservationChanges,
@@ -276,8 +276,8 @@ def observed_in(
         fix = "give the photo, or the camera"
         raise DataError("the photo's size is unknown", where=found.source, fix=fix)
     require_one_size(sizes, image)
-    camera = camera or Camera.without_focal(*next(iter(sizes.values())))
-    return replace(changes, camera=None).applied_to(
+    camera = camera or Camera.drop_focal(*next(iter(sizes.values())))
+    return replace(changes, camera=None).apply(
         join_keypoints(found, model, camera, image=image, **how)
     )
 
@@ -302,6 +302,6 @@ def plain_name(name: str) -> str:
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
-def some_of(names: Sequence[str]) -> str:
+def first_names(names: Sequence[str]) -> str:
     """List the first five names, for a message."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

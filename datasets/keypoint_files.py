@@ -15,7 +15,7 @@ from cadalign.datasets.coco import read_coco_keypoints
 from cadalign.datasets.image_keypoints import ImageKeypoints
 from cadalign.datasets.records import collect_error
 from cadalign.errors import DataError, InputError, brief, quote
-from cadalign.io.documents import in_file
+from cadalign.io.documents import name_file
 from cadalign.io.files import as_path, read_text
 
 _NUMBERS = ("u", "v", "semantic_id", "score", "sigma")
@@ -102,7 +102,7 @@ def _parse_row(header: list[str], line: list[str], where: str) -> dict[str, Any]
     is_missing = all(cells[name].lower() in _MISSING for name in ("u", "v"))
     if is_missing:
         cells = cells | {name: text for name, text in _MISSING_VALUES.items() if name in cells}
-    with in_file(where):
+    with name_file(where):
         row = {
             name: _parse_number(name, cell) if name in _NUMBERS else cell
             for name, cell in cells.items()

@@ -31,10 +31,10 @@ from cadalign.datasets.shapenet import (
     require_category,
     synset_of_name,
 )
-from cadalign.errors import DataError, InputError, quote, unknown
+from cadalign.errors import DataError, InputError, quote, unknown_name
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.files import as_path, listed, read_text
+from cadalign.io.files import as_path, list_folder, read_text
 from cadalign.io.meshes.files import load_mesh
 
 logger = logging.getLogger("cadalign")
@@ -100,7 +100,7 @@ class AnnotatedModel:
             return mesh
         fix = "give the mesh of ShapeNetCore.v2, or load this one with check=False"
         try:
-            rebuilt = self.keypoints.on_mesh(mesh)
+            rebuilt = self.keypoints.locate(mesh)
         except InputError as error:
             raise DataError(error.what, where=where, fix=fix) from None
         gaps = np.linalg.norm(rebuilt - self.keypoints.xyz, axis=1)
@@ -176,7 +176,9 @@ class KeypointNet:
         self._allowed: frozenset[ModelKey] | None = None
         self._with_mesh = False
         folder = self.root / "annotations"
-        self._files = {path.stem: path for path in listed(folder, "*.json") if path.stem != _ALL}
+        self._files = {
+            path.stem: path for path in list_folder(folder, "*.json") if path.stem != _ALL
+        }
         if not self._files:
             fix = "give the folder that holds KeypointNet's annotations/ and splits/"
             raise DataError("no annotations/*.json below it", where=str(self.root), fix=fix)
@@ -187,7 +189,7 @@ class KeypointNet:
     @property
     def splits(self) -> tuple[str, ...]:
         """Names of the splits, sorted."""
-        return tuple(path.stem for path in listed(self.root / "splits", "*.txt"))
+        return tuple(path.stem for path in list_folder(self.root / "splits", "*.txt"))
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -206,7 +208,7 @@ class KeypointNet:
             If a line of its file is not ``<synset>-<model id>``.
         """
         if name not in self.splits:
-            raise unknown("split", name, self.splits, where=str(self.root / "splits"))
+            raise unknown_name("split", name, self.splits, where=str(self.root / "splits"))
         path, members = self.root / "splits" / f"{name}.txt", set()
         for number, line in enumerate(read_text(path, errors="replace").splitlines(), start=1):
             synset, _, model_id = line.strip().partition("-")

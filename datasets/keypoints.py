@@ -60,7 +60,7 @@ class Keypoints:
         """Iterate over the (id, position (3,)) of each keypoint."""
         return zip(self.ids.tolist(), self.xyz, strict=True)
 
-    def on_mesh(self, mesh: Mesh) -> FloatArray:
+    def locate(self, mesh: Mesh) -> FloatArray:
         """Compute the positions from faces and barycentric coordinates, (k, 3) float.
 
         Raises InputError if a face index is not a face of the mesh.

@@ -22,7 +22,7 @@ from cadalign.io.documents import (
     Point3,
     Text,
     convert,
-    in_file,
+    name_file,
     path_from,
     read_json,
     require_unique,
@@ -112,7 +112,7 @@ class ModelKeypoints:
         return np.array([keypoint.xyz for keypoint in self.keypoints], dtype=float).reshape(-1, 3)
 
     @classmethod
-    def of_model(cls, model: AnnotatedModel) -> ModelKeypoints:
+    def from_model(cls, model: AnnotatedModel) -> ModelKeypoints:
         """Name the keypoints of a KeypointNet model by their ids, such as "keypoint 3"."""
         rows = zip(model.keypoints.ids.tolist(), model.keypoints.xyz.tolist(), strict=True)
         keypoints = (ModelKeypoint(f"keypoint {k}", tuple(xyz), k) for k, xyz in rows)
@@ -141,7 +141,7 @@ class ModelKeypoints:
         if not isinstance(data, dict):
             what = "a list, not an object of model keypoints"
             raise DataError(what, where=str(path), fix=_WANTED)
-        with in_file(path):
+        with name_file(path):
             read: _File = convert(data, _File)
             model = mesh if read.model is None else path_from(read.model, path.parent)
             keypoints = (ModelKeypoint(e.name, e.xyz, e.semantic_id) for e in read.keypoints)

@@ -40,9 +40,9 @@ from cadalign.io.documents import (
     Point2,
     Text,
     convert,
-    in_file,
+    name_file,
 )
-from cadalign.io.files import as_path, listed, read_bytes
+from cadalign.io.files import as_path, list_folder, read_bytes
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
@@ -106,7 +106,7 @@ class Pascal3D(PhotoDataset):
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")
-        self._files = listed(folder, _FILES)
+        self._files = list_folder(folder, _FILES)
         if not self._files:
             fix = "give the folder of PASCAL3D+"
             raise DataError(f"there are no {_FILES}", where=str(folder), fix=fix)
@@ -122,7 +122,7 @@ class Pascal3D(PhotoDataset):
         image = find_first_file(self.root / _IMAGES / f"{name}{end}" for end in _ENDINGS)
         if image is None:
             raise DataError(f"its image is not in {_IMAGES}", where=str(path))
-        camera = Camera.without_focal(*photo_size(image))
+        camera = Camera.drop_focal(*photo_size(image))
 
         def read_object(number: int, each: Any) -> PhotoObject | None:
             shown: _Object = convert(each, _Object)
@@ -205,7 +205,7 @@ def _truth(viewpoint: dict[str, Any], camera: Camera) -> Truth:
 def _load_mesh(path: Path, category: str, index: int) -> Mesh:
     found = _find_cad(path, category, index)
     where = f"{path}: model {index}"
-    with in_file(where):
+    with name_file(where):
         vertices, faces = _rows(found, "vertices"), _rows(found, "faces")
         if not (np.abs(faces) < _MOST_VERTICES).all():
             raise InputError("vertex indices are out of range", where="faces")
@@ -214,7 +214,7 @@ def _load_mesh(path: Path, category: str, index: int) -> Mesh:
 
 def _load_keypoints(path: Path, category: str, index: int) -> NamedPoints | None:
     found = _find_cad(path, category, index)
-    with in_file(f"{path}: model {index}"):
+    with name_file(f"{path}: model {index}"):
         given = found.get("pnames") or []
         names = convert([given] if isinstance(given, str) else given, list[Text], "pnames")
         anchors = {name: _rows(found, name) for name in names if found.get(name) is not None}

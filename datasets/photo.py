@@ -18,8 +18,8 @@ from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.documents import in_file
-from cadalign.io.files import damaged, read_text
+from cadalign.io.documents import name_file
+from cadalign.io.files import damage_error, read_text
 from cadalign.io.images import ByteImage, open_photo, read_photo
 from cadalign.io.meshes.files import load_mesh
 
@@ -151,7 +151,7 @@ class Photo:
     image: Path | None
     """The image file; None if it is missing."""
     camera: Camera | None
-    """The camera, `Camera.without_focal` if the focal length is unknown; None if the image's size
+    """The camera, `Camera.drop_focal` if the focal length is unknown; None if the image's size
     is unknown, too."""
     objects: tuple[PhotoObject, ...]
     """The objects whose annotation could be read."""
@@ -230,16 +230,16 @@ def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
     try:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
-        raise damaged("not a table of numbers", path) from None
-    with in_file(path):
+        raise damage_error("not a table of numbers", path) from None
+    with name_file(path):
         return as_floats(matrix, name="matrix", shape=shape)
 
 
-def existing(path: Path) -> Path | None:
+def existing_file(path: Path) -> Path | None:
     """Return the path if it is a file, else None, also for an invalid file name."""
     return path if os.path.isfile(path) else None
 
 
 def find_first_file(paths: Iterable[Path]) -> Path | None:
     """Return the first path that is a file, or None."""
-    return next((path for path in paths if existing(path)), None)
+    return next((path for path in paths if existing_file(path)), None)

@@ -22,7 +22,7 @@ from cadalign.datasets.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
-    existing,
+    existing_file,
     read_matrix,
 )
 from cadalign.datasets.records import read_list
@@ -40,7 +40,7 @@ from cadalign.io.documents import (
     Positive,
     Text,
     convert,
-    in_file,
+    name_file,
 )
 from cadalign.io.files import as_path
 from cadalign.io.meshes.files import load_mesh
@@ -92,7 +92,7 @@ class Pix3D(PhotoDataset):
     def read(self, index: int) -> Photo:
         """Read the photo at a position, counted from 0."""
         path = self.root / ANNOTATIONS
-        with in_file(path):
+        with name_file(path):
             entry: _Entry = convert(self._entries[index], _Entry, f"[{index}]")
         width, height = map(int, entry.img_size)
         camera = _camera(width, height, entry.focal_length)
@@ -102,10 +102,10 @@ class Pix3D(PhotoDataset):
             truth=_truth(entry),
             keypoints=_keypoints(entry),
             model=self._model(entry),
-            mask_path=existing(self.root / entry.mask),
+            mask_path=existing_file(self.root / entry.mask),
             bbox=np.array(entry.bbox) - PIXEL_CENTRE,
         )
-        return Photo(self.names[index], existing(self.root / entry.img), camera, (shown,))
+        return Photo(self.names[index], existing_file(self.root / entry.img), camera, (shown,))
 
     def _model(self, entry: _Entry) -> CadModel:
         mesh, keypoints = partial(_load, self.root / entry.model, load_mesh), None
@@ -116,7 +116,7 @@ class Pix3D(PhotoDataset):
 
 def _load(path: Path, read: Callable[[Path], T]) -> T | None:
     """Read a model's file; None if it is missing."""
-    return read(path) if existing(path) else None
+    return read(path) if existing_file(path) else None
 
 
 def _read_keypoints(path: Path) -> NamedPoints:
@@ -127,7 +127,7 @@ def _read_keypoints(path: Path) -> NamedPoints:
 @lru_cache(maxsize=64)
 def _camera(width: int, height: int, focal_length: float) -> Camera:
     """The camera for an image size [px] and a focal length [mm]."""
-    return Camera.without_focal(width, height).with_focal(focal_length / _SENSOR * width)
+    return Camera.drop_focal(width, height).replace_focal(focal_length / _SENSOR * width)
 
 
 def _truth(entry: _Entry) -> Truth:

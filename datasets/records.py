@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.errors import CadalignError, DataError, quote
 from cadalign.io.documents import read_json
-from cadalign.io.files import damaged
+from cadalign.io.files import damage_error
 
 logger = logging.getLogger("cadalign")
 
@@ -134,7 +134,7 @@ def read_list(path: Path) -> list[Any]:
     try:
         found = read_json(path)
     except DataError as error:
-        raise damaged(error.what, error.where) from None
+        raise damage_error(error.what, error.where) from None
     if not isinstance(found, list):
         raise DataError(f"{quote(found)} is not a list", where=str(path))
     return found

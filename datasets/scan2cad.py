@@ -23,7 +23,7 @@ from cadalign.datasets.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
-    existing,
+    existing_file,
     find_first_file,
     read_each,
     read_matrix,
@@ -35,8 +35,8 @@ from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, in_file
-from cadalign.io.files import as_path, listed
+from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, name_file
+from cadalign.io.files import as_path, list_folder
 from cadalign.io.images import photo_size
 
 FULL = "full_annotations.json"
@@ -143,7 +143,7 @@ class Scan2CAD(PhotoDataset):
         names: list[str] = []
         bad: dict[str, DataError] = {}
         for number, entry in enumerate(entries := read_list(annotations)):
-            with collect_error(f"[{number}]", bad), in_file(annotations):
+            with collect_error(f"[{number}]", bad), name_file(annotations):
                 scan: _Scan = convert(entry, _Scan, f"[{number}]")
                 for frame in _find_frames(scan.id_scan, [folder / name for name in _FRAME_FOLDERS]):
                     self._records.append((scan, frame))
@@ -276,7 +276,7 @@ class _Frame:
         matrix = read_matrix(self.intrinsics_path, (4, 4))
         width, height = photo_size(self.image_path)
         (fx, _, cx), (_, fy, cy) = matrix[:2, :3].tolist()
-        with in_file(self.intrinsics_path):
+        with name_file(self.intrinsics_path):
             return Camera(width, height, fx, fy, cx, cy)
 
     def cam_from_scan(self) -> Alignment:
@@ -285,7 +285,7 @@ class _Frame:
         Raises DataError if it is invalid: ScanNet writes -inf for frames with lost tracking.
         """
         pose = read_matrix(self.pose_path, (4, 4))
-        with in_file(self.pose_path):
+        with name_file(self.pose_path):
             rotation = nearest_rotation(pose[:3, :3]).T
         return Alignment(rotation, -rotation @ pose[:3, 3], np.ones(3))
 
@@ -303,7 +303,7 @@ def _scene_folder_frames(folder: Path) -> Iterator[_Frame]:
     intrinsics = find_first_file(folder / name for name in _INTRINSICS)
     if intrinsics is None:
         return
-    for image in listed(folder / "color", "*"):
+    for image in list_folder(folder / "color", "*"):
         if image.suffix.lower() in _IMAGES:
             yield _Frame(image.stem, image, folder / "pose" / f"{image.stem}.txt", intrinsics)
 
@@ -311,7 +311,7 @@ def _scene_folder_frames(folder: Path) -> Iterator[_Frame]:
 def _flat_folder_frames(folder: Path, scene: str) -> Iterator[_Frame]:
     prefix = f"scannet_{scene.removeprefix('scene')}_"
     intrinsics = folder / f"{prefix}intr.txt"
-    if not existing(intrinsics):
+    if not existing_file(intrinsics):
         return
     for pose in folder.glob(f"{prefix}*_pose.txt"):
         stem = pose.name.removesuffix("_pose.txt")

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import overload
 
-from cadalign.errors import DataError, InputError, unknown
+from cadalign.errors import DataError, InputError, unknown_name
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import as_path
 from cadalign.io.meshes.files import load_mesh
@@ -55,7 +55,7 @@ def require_category(name: str, known: Iterable[str], *, where: str) -> str:
     for candidate in (name, name_of_synset(name)):
         if candidate in names:
             return candidate
-    raise unknown("category", name, names, where=where)
+    raise unknown_name("category", name, names, where=where)
 
 
 @dataclass(frozen=True)

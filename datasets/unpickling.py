@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from cadalign.errors import DataError, quote
-from cadalign.io.documents import in_file
-from cadalign.io.files import as_path, damaged, read_bytes
+from cadalign.io.documents import name_file
+from cadalign.io.files import as_path, damage_error, read_bytes
 
 # Numbers, text and objects; no structured types, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU][1-9]\d{0,5}|O\d?")
@@ -47,7 +47,7 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
     """
     data = read_bytes(as_path(path))
     try:
-        with in_file(str(path)):
+        with name_file(str(path)):
             for step, argument, _ in pickletools.genops(data):
                 if not _STEPS.fullmatch(step.name):
                     raise ValueError(f"the opcode {step.name} is not allowed")
@@ -59,7 +59,7 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
         raise
     except Exception as error:  # any opcode of a damaged pickle may fail
         reason = f"{type(error).__name__}: {str(error)[:200]}"
-        raise damaged(f"not a whole pickle of arrays ({reason})", path) from None
+        raise damage_error(f"not a whole pickle of arrays ({reason})", path) from None
 
 
 class _Dtype:

@@ -24,7 +24,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Material
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.render.canvas import ByteImage, LinearArray
-from cadalign.render.posed import Rectangle, pose_scene
+from cadalign.render.posed_scene import Rectangle, pose_scene
 from cadalign.render.raycast import (
     RaycastRenderer,
     check_samples,

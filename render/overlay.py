@@ -22,7 +22,7 @@ from cadalign.io.meshes.files import load_mesh, mesh_at
 from cadalign.io.observation import Observation
 from cadalign.render.canvas import ByteImage, Canvas, Color, LegendEntry, composite
 from cadalign.render.layers import KeypointMarks, blend_model, confidence_regions, draw_lines
-from cadalign.render.posed import within_lens_field
+from cadalign.render.posed_scene import within_lens_field
 from cadalign.render.raycast import RaycastRenderer, cast_geometry
 from cadalign.render.scene import LIGHT_GREY, Geometry, Scene, check_image_size
 

@@ -12,7 +12,7 @@ from importlib import import_module
 
 import numpy as np
 
-from cadalign.errors import CadalignError, RenderError, unknown
+from cadalign.errors import CadalignError, RenderError, unknown_name
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -67,7 +67,7 @@ def probe_renderer(name: str) -> Probe:
         If the name is unknown.
     """
     if name not in RENDERERS:
-        raise unknown("renderer", name, RENDERERS)
+        raise unknown_name("renderer", name, RENDERERS)
     arguments = [json.dumps(sys.path), name]
     try:
         child = subprocess.run(
@@ -166,7 +166,7 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
     if name == AUTO:
         return load_renderer(best_renderer(), studio)
     if name not in RENDERERS:
-        raise unknown("renderer", name, [AUTO, *RENDERERS])
+        raise unknown_name("renderer", name, [AUTO, *RENDERERS])
     if name != "raycast":
         found = probe_renderer(name)
         if not found.works:

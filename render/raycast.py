@@ -14,7 +14,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.canvas import ByteImage, LinearArray, bytes_from_linear
-from cadalign.render.posed import PosedScene, Rectangle, draw_in_threads, pose_scene
+from cadalign.render.posed_scene import PosedScene, Rectangle, draw_in_threads, pose_scene
 from cadalign.render.scene import Frame, Geometry, Scene, check_image_size
 from cadalign.render.surface import Studio
 
@@ -276,7 +276,9 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> LinearArra
 
     def look(part: slice) -> None:
         directions = _sky_directions(normal[hit][part], tile[part]).reshape(-1, 3)
-        blocked = posed.blocked(np.repeat(points[part], _RAYS, axis=0), directions, reach=reach)
+        blocked = posed.occlusion_mask(
+            np.repeat(points[part], _RAYS, axis=0), directions, reach=reach
+        )
         rows_of, columns_of = inside[part].T
         sky[rows_of, columns_of] = 1 - blocked.reshape(-1, _RAYS).mean(axis=1)
 

@@ -11,7 +11,7 @@ from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError, RenderError, TooFewVisibleError
 from cadalign.geometry.alignment import Alignment, Box, model_rays
 from cadalign.geometry.camera import Camera
-from cadalign.render.posed import within_lens_field
+from cadalign.render.posed_scene import within_lens_field
 from cadalign.render.scene import Scene
 
 _ATTEMPTS = 100

@@ -13,7 +13,7 @@ from __future__ import annotations
 import sys
 
 import tyro
-from benchmarks.accuracy import accuracy, shapes
+from benchmarks.accuracy import accuracy
 from benchmarks.cars import cars
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
@@ -21,6 +21,7 @@ from benchmarks.photo import photo
 from benchmarks.retrieval import retrieval
 from benchmarks.runs import runs
 from benchmarks.section import BenchmarkData, Section, markdown
+from benchmarks.shapes import shapes
 from benchmarks.speed import cold, speed
 
 from cadalign.errors import DataError

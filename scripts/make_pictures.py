@@ -84,7 +84,7 @@ def chairs(*, files: Path | None = None) -> None:
         photo = root / "photo.png"
         observation = observe(seen, own, photo)
         observation.save(root / "photo.json")
-        ModelKeypoints.of_model(own).save(root / f"{own.model_id}.keypoints.json")
+        ModelKeypoints.from_model(own).save(root / f"{own.model_id}.keypoints.json")
         result = fit(observation.points_3d, observation.points_2d, observation.camera, sigma=None)
         print(result)
 

@@ -27,7 +27,7 @@ from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import ALL, Summary, csv_text
-from cadalign.io.files import made_folder, write_text
+from cadalign.io.files import create_folder, write_text
 
 _DATASETS = {
     "sample": "The sample dataset (parametric models, visibility by rays)",
@@ -67,7 +67,7 @@ class PaperPlan(RunOptions):
 
 def reproduce_paper(plan: PaperPlan) -> Path:
     """Run or continue everything; returns the path of ``report.md``."""
-    made_folder(plan.out)
+    create_folder(plan.out)
     quick = " Numbers are rough, as --quick uses few problems." if plan.quick else ""
     sections = [
         "# The AEPnP paper's tables and figures\n",

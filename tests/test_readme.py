@@ -40,7 +40,7 @@ def test_snippets_run_in_an_empty_folder_and_find_the_stretch(
     np.testing.assert_array_equal(names["model"], KEYPOINTS)
     np.testing.assert_array_equal(names["photo"], FOUND)
     same = cadalign.Result.load(tmp_path / "photo_fit" / "fit.json")
-    np.testing.assert_allclose(same.alignment.packed, result.alignment.packed, atol=1e-9)
+    np.testing.assert_allclose(same.alignment.vector, result.alignment.vector, atol=1e-9)
     photo = cv2.imread(str(tmp_path / "photo.jpg"))
     seat = photo[300, 320].astype(int) - photo[5, 5]
     assert np.abs(seat).max() > 50  # the chair is drawn where its keypoints are

@@ -195,7 +195,7 @@ def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
     camera = state.marks.camera
     low, high = (bound * camera.width for bound in _FOCAL_RANGE)
     if pixels is None:
-        camera = Camera.without_focal(
+        camera = Camera.drop_focal(
             camera.width,
             camera.height,
             cx=camera.cx,
@@ -203,7 +203,7 @@ def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
             distortion=camera.distortion,
         )
     elif low <= pixels <= high:
-        camera = camera.with_focal(pixels)
+        camera = camera.replace_focal(pixels)
     else:
         what = f"{pixels:g} px is not a focal length of this photo"
         raise InputError(what, where="pixels", fix=f"give {low:.0f} to {high:.0f} px")

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from cadalign.datasets.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
-from cadalign.io.files import checksum, locked, read_bytes
+from cadalign.io.files import checksum, hold_lock, read_bytes
 
 logger = logging.getLogger("cadalign")
 
@@ -60,7 +60,7 @@ class SessionOptions:
 def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a folder until this process ends; raises DataError if another annotator holds it."""
     what = "another annotator has this folder open"
-    with locked(folder / _LOCK, what, fix=f"use or close its page, or {_OTHER_FOLDER}"):
+    with hold_lock(folder / _LOCK, what, fix=f"use or close its page, or {_OTHER_FOLDER}"):
         yield
 
 

@@ -26,7 +26,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import Document, Point2, convert, in_file, read_json, within
+from cadalign.io.documents import Document, Point2, convert, name_file, name_part, read_json
 from cadalign.io.evidence import KeypointFields
 from cadalign.io.focal import FocalPrior
 from cadalign.io.images import write_image
@@ -95,8 +95,8 @@ class ObservationFile:
                 self.model, self.shape = open_skeleton(own), own
         refuse_other_photo(stored.image, self.photo.path, where=self.path)
         self._warn_of_options(stored)
-        with in_file(self.path), within("unfinished"):
-            unfinished = convert(stored.unfinished or {}, _Unfinished)
+        with name_file(self.path), name_part("unfinished"):
+            unfinished = convert(stored.draft or {}, _Unfinished)
         self.stored = stored if up_axis is None else replace(stored, up_axis=up_axis)
         mask = stored.evidence.mask
         marks = Marks(
@@ -182,7 +182,7 @@ class ObservationFile:
             fit_options=options,
             shape=self._shape_file,
             init=marks.start if len(pairs) < LEAST_JOINT_PAIRS else None,
-            unfinished={"pairs": halves} if halves else None,
+            draft={"pairs": halves} if halves else None,
         )
 
     @property
@@ -219,7 +219,7 @@ class ObservationFile:
         if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
             # All pairs were deleted. The view keeps its other fields, the file keeps the rest.
             of_the_object = {name: data.pop(name) for name in _OF_THE_OBJECT if name in data}
-            with in_file(self.path):
+            with name_file(self.path):
                 data = {"views": [data], **of_the_object}
                 return Observation.from_dict(data, folder=self.path.parent)
         return Observation.load(self.path)

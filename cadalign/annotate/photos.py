@@ -16,8 +16,8 @@ from PIL import Image
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import in_file
-from cadalign.io.files import listed, read_bytes, reading, require_utf8
+from cadalign.io.documents import name_file
+from cadalign.io.files import guard_reading, list_folder, read_bytes, require_utf8
 from cadalign.io.focal import FocalPrior
 from cadalign.io.images import open_photo, open_picture, photo_size, read_mask, upright_pixels
 from cadalign.io.kinds import PHOTO_ENDINGS
@@ -50,7 +50,7 @@ class PhotoFile:
     def likely_focal(self) -> FocalPrior:
         """Prior on an unknown focal length: from the EXIF data, or for usual lenses."""
         exif = FocalPrior.from_exif(self.path)
-        return exif or FocalPrior.of_usual_lenses(self.width, self.height)
+        return exif or FocalPrior.from_size(self.width, self.height)
 
     def encode(self) -> tuple[str, bytes]:
         """Encode the upright photo for a browser: media type and bytes.
@@ -71,9 +71,9 @@ class PhotoFile:
 
 def find_photos(path: Path) -> list[Path]:
     """List the photos of a folder in natural order of their names, or the given photo."""
-    with reading(path):
+    with guard_reading(path):
         in_folder, exists = path.is_dir(), path.exists()
-        entries = listed(path) if in_folder else []
+        entries = list_folder(path) if in_folder else []
     if in_folder:
         photos = [p for p in entries if p.suffix.lower() in PHOTO_ENDINGS and p.is_file()]
         stems = {p.stem for p in photos}
@@ -91,7 +91,7 @@ def find_photos(path: Path) -> list[Path]:
 def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
     """Return a photo's camera, by default without a focal length; raises DataError for others."""
     if camera is None:
-        return Camera.without_focal(photo.width, photo.height)
+        return Camera.drop_focal(photo.width, photo.height)
     if (camera.width, camera.height) != (photo.width, photo.height):
         raise DataError(
             f"the photo has {photo.width} x {photo.height} pixels, the camera "
@@ -99,7 +99,7 @@ def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
             where=str(photo.path),
             fix="give the camera of this photo",
         )
-    with in_file(photo.path):
+    with name_file(photo.path):
         if camera.is_wide:
             what = f"the annotator does not support {camera.lens} lenses"
             fix = "undistort the photo, or crop it to a pinhole's view"

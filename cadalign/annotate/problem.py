@@ -114,7 +114,7 @@ class LiveProblem:
         model, has_photo = known.model_for(observation), "image" in observation.fit_options
         estimates_focal = not observation.camera.focal_known
         if estimates_focal:
-            observation = replace(observation, camera=observation.camera.with_focal(known.focal))
+            observation = replace(observation, camera=observation.camera.replace_focal(known.focal))
         (view,) = views_of(observation, model, with_photos=has_photo)
         states_noise = observation.sigma is not None and not observation.is_plain
         estimates_noise = not (known.shape.learned or states_noise) and bool(len(view.keypoint_ids))

@@ -191,7 +191,7 @@ class Annotation:
         return LiveAlignment(estimate, "", counts, lines)
 
     def _estimate(self, observation: Observation) -> LiveEstimate:
-        depends = replace(observation, unfinished=None).to_dict()
+        depends = replace(observation, draft=None).to_dict()
         key = json.dumps([depends, hash(self.marks.mask)])  # a mask's path may stay the same
         if self._estimated is None or self._estimated[0] != key:
             mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
@@ -329,7 +329,7 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
     for photo, path in files:
         camera = camera_of(photo, given)
         if options.focal is not None:
-            camera = camera.with_focal(options.focal)
+            camera = camera.replace_focal(options.focal)
         file = ObservationFile(path, photo, model, shape)
         marks = file.read(camera, up_axis=up_axis)
         session.photos.append(Annotation(file, History(marks)))

@@ -16,8 +16,8 @@ import numpy as np
 
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
-from cadalign.estimation.result_parts import quickly
-from cadalign.io.documents import convert, in_file, within
+from cadalign.estimation.result_parts import create_unchecked
+from cadalign.io.documents import convert, name_file, name_part
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.io.observation import FitFields, Observation, ObservationChanges
@@ -96,11 +96,11 @@ class ObservationFit:
         ``where`` names it in messages. With a learned shape, keypoints need no ``xyz``.
         """
         needs_xyz = None if self.shape is None and self.shape_sigma is None else self.shape is None
-        with in_file(where):
+        with name_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
-        return changes.applied_to(seen, where)  # outside of `in_file`: errors name options
+        return changes.apply(seen, where)  # outside of `name_file`: errors name options
 
-    def changed(self, seen: Observation) -> Observation:
+    def override(self, seen: Observation) -> Observation:
         """Override the stored settings of an observation by the options that are set.
 
         Raises InputError if an option has no effect with a shape or with further evidence.
@@ -115,7 +115,7 @@ class ObservationFit:
         options = stored | given
         # Skips the checks of the observation, which take as long as a linear solver.
         fields = {"shape": shape and shape.absolute(), "fit_options": options}
-        changed = quickly(Observation, vars(seen) | fields)
+        changed = create_unchecked(Observation, vars(seen) | fields)
         if not _is_plain(changed):
             self._refuse_without_effect(changed)
         has_prior = options.get("method", "optimal") == "optimal"
@@ -135,7 +135,7 @@ class ObservationFit:
                 raise InputError(what, where=name, fix=fix)
 
     def fit(self, seen: Observation, where: str, *, note: Note = lambda text: None) -> Result:
-        """Align an observation that `changed` has returned; ``where`` names it in messages.
+        """Align an observation that `override` has returned; ``where`` names it in messages.
 
         ``note`` is called with the keypoints that are left out, and the prior on a focal length.
         Raises CadalignError if an option or the observation is invalid, or if no alignment exists.
@@ -147,7 +147,7 @@ class ObservationFit:
         if seen.model is not None and seen.shape is None:
             from cadalign.io.meshes.files import check_keypoints
 
-            with in_file(where):
+            with name_file(where):
                 for view in seen.views:
                     check_keypoints(view.points_3d, seen.model, where="keypoints.xyz")
         if _is_plain(seen):
@@ -192,7 +192,7 @@ class ObservationFit:
         if has_photos and all(image.image is None for image in seen.views):
             fix = "add its path as the field image, or leave out the option"
             raise InputError("the observation names no photo", where="use_photo", fix=fix)
-        with in_file(where):
+        with name_file(where):
             stated = {"sigma": given["sigma"]} if "sigma" in given else {}
             views = views_of(seen, model, with_photos=has_photos, **stated)
         with self._locate_errors(where):
@@ -231,7 +231,7 @@ class ObservationFit:
         except InputError as error:
             if error.where in self.given:
                 raise
-            with in_file(where), within(part) if part else nullcontext():
+            with name_file(where), name_part(part) if part else nullcontext():
                 raise
 
 
@@ -300,7 +300,7 @@ def views_of(
     labels = own_ids(observation.views)
     views = []
     for number, image in enumerate(observation.views):
-        with within(f"views[{number}]") if observation.others else nullcontext():
+        with name_part(f"views[{number}]") if observation.others else nullcontext():
             ids = shape_ids(image, model) if isinstance(model, ShapeModel) else labels[number]
             evidence = image.evidence.given
             if image.depths is not None:

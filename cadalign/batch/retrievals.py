@@ -39,10 +39,10 @@ class RetrieveRunOptions(FitRunOptions):
         return *named, own.library, own.shape, own.keypoint_names
 
     def keypoints(self) -> ModelKeypoints:
-        return self.estimate.opened()[0].keypoints
+        return self.estimate.open_files()[0].keypoints
 
     def estimate_of(self, seen: Observation, where: str) -> Estimate:
-        seen = self.estimate.with_ids(seen, where)
+        seen = self.estimate.resolve_ids(seen, where)
         matches = self.estimate.retrieve(seen, where, workers=1)
         best = matches[0]
         cells = {

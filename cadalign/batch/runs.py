@@ -23,7 +23,7 @@ from cadalign.batch.outputs import (
     write_csv,
 )
 from cadalign.batch.sources import ObservationTask, ObservationTasks
-from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in, photo_in
+from cadalign.datasets.image_keypoints import ImageKeypoints, find_photo, observe_keypoints
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError, quote, require_kind
 from cadalign.estimation.result import Result
@@ -33,8 +33,8 @@ from cadalign.evaluation.runs.engine import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.results import failed_row
-from cadalign.io.documents import in_file, parse_json
-from cadalign.io.files import as_path, made_folder, read_bytes, write_text
+from cadalign.io.documents import name_file, parse_json
+from cadalign.io.files import as_path, create_folder, read_bytes, write_text
 from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
@@ -99,7 +99,7 @@ class FitRunOptions(ExperimentOptions):
 
     def estimate_of(self, seen: Observation, where: str) -> Estimate:
         """Align an observation; raises CadalignError if that fails."""
-        seen = self.estimate.changed(seen)
+        seen = self.estimate.override(seen)
         return seen, self.estimate.fit(seen, where), {}
 
 
@@ -160,8 +160,8 @@ class ManyEstimates:
         detector = options.detector
         assert self.model is not None
         photos, named = detector.images or folder, content.image
-        with in_file(content.source):
-            return observed_in(
+        with name_file(content.source):
+            return observe_keypoints(
                 content,
                 self.model,
                 options.changes,
@@ -171,7 +171,7 @@ class ManyEstimates:
             )
 
 
-_photo_in = lru_cache(maxsize=1024)(photo_in)
+_photo_in = lru_cache(maxsize=1024)(find_photo)
 
 
 def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
@@ -192,7 +192,7 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
         try:
             require_one_size(known, view.image)
         except DataError as error:
-            yield "camera", f"{error} (`Camera.resized`, `Camera.cropped`)"
+            yield "camera", f"{error} (`Camera.resize`, `Camera.crop`)"
 
 
 def plan_run(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:
@@ -365,7 +365,7 @@ def _inputs(observations: Any, beside: Path) -> tuple[Path, ...]:
         return tuple(as_path(each, f"observations[{k}]") for k, each in enumerate(given))
     for number, each in enumerate(given):
         require_kind(each, Observation, f"observations[{number}]")
-    made_folder(beside.parent)
+    create_folder(beside.parent)
     lines = [json_of(each.to_dict(folder=beside.absolute().parent)).decode() for each in given]
     text = "".join(f"{line}\n" for line in lines)
     if beside.exists() and read_bytes(beside) != text.encode():

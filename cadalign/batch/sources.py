@@ -20,7 +20,7 @@ from cadalign.datasets.image_keypoints import ImageKeypoints
 from cadalign.datasets.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.io.documents import read_json
-from cadalign.io.files import listed, open_input, read_bytes, read_text
+from cadalign.io.files import list_folder, open_input, read_bytes, read_text
 from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
 
 _CELLS = 3  # per task: index of its source, its index or line there, offset of its line
@@ -133,7 +133,7 @@ def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:
         yield path, kind
         return
     is_empty = True
-    for each in listed(path):
+    for each in list_folder(path):
         if each.suffix.lower() in (".json", *LINES) and each.is_file():
             kind = _kind_of(each)
             if kind == OBSERVATION:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import gc
 import logging
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, is_dataclass, replace
 from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
@@ -14,11 +14,17 @@ from operator import or_
 from typing import Annotated, Any
 
 import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
 from cadalign import __version__
 from cadalign.cli.common import UsageError
 from cadalign.errors import CadalignError
-from cadalign.io.files import keeping
+from cadalign.io.files import protect_inputs
 
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
 COMMANDS = {  # module and class, and the first sentence of the help
@@ -69,11 +75,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given == ["--version"]:
         sys.stdout.write(f"cadalign {__version__}\n")
         return 0
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.addFilter(drop_repeats())
+    logging.basicConfig(format="%(levelname)s: %(message)s", handlers=[handler])
     # Imports create a million permanent objects. Rarer collections save 6 % of a start.
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
     try:
-        with keeping(()):  # protects the models and textures that are read from being overwritten
+        with protect_inputs(
+            ()
+        ):  # protects the models and textures that are read from being overwritten
             return int(_parse(given).run())
     except UsageError as error:
         sys.stderr.write(f"cadalign: {error}\n")
@@ -86,6 +96,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:  # the reader of the output has closed it
         return 0
+
+
+def drop_repeats() -> Callable[[logging.LogRecord], bool]:
+    """Make a filter that passes each text once: commands read some files several times."""
+    texts = set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        before = len(texts)
+        texts.add(record.getMessage())
+        return len(texts) > before
+
+    return is_new
 
 
 def class_of(name: str) -> Any:
@@ -102,7 +124,10 @@ def _parse(arguments: list[str]) -> Any:
         command = class_of(name)
         about = cleandoc(str(command.__doc__))
         prog = f"cadalign {name}"
-        return tyro.cli(command, prog=prog, description=about, args=rest, config=config)
+        rules = _help_rules()
+        return tyro.cli(
+            command, prog=prog, description=about, args=rest, config=config, registry=rules
+        )
     stubs = [
         Annotated[_CommandStub, tyro.conf.subcommand(name, description=summary)]
         for name, (_, summary) in COMMANDS.items()
@@ -116,6 +141,35 @@ def _parse(arguments: list[str]) -> Any:
         args=arguments,
         config=config,
     )
+
+
+def _help_rules() -> ConstructorRegistry:
+    """Make rules that join the lines of options' help and omit hints such as (default: None)."""
+    registry, inner = ConstructorRegistry(), False
+
+    @registry.struct_rule
+    def describe(info: StructTypeInfo) -> StructConstructorSpec | None:
+        nonlocal inner
+        if inner or not is_dataclass(info.type):
+            return None
+        inner = True  # tyro's own rule, not this one
+        spec: Any = ConstructorRegistry.get_struct_spec(info)
+        inner = False
+        found: StructConstructorSpec = replace(spec, fields=tuple(map(_describe, spec.fields)))
+        return found
+
+    return registry
+
+
+def _describe(field: StructFieldSpec) -> StructFieldSpec:
+    def help_of(text: Any = field.helptext) -> str | None:
+        text = text() if callable(text) else text
+        return text and " ".join(text.split())
+
+    kind: Any = field.type
+    if field.default is None or field.default is False or field.default == ():
+        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
+    return replace(field, helptext=help_of, type=kind)
 
 
 @dataclass(frozen=True)

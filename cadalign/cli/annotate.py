@@ -13,7 +13,7 @@ import tyro
 
 from cadalign.annotate.files import SessionOptions, lock_folder
 from cadalign.cli.common import UsageError, answer, say, show_status
-from cadalign.io.files import made_folder, writing
+from cadalign.io.files import create_folder, guard_writing
 from cadalign.io.kinds import MESH, PHOTO, kind_of_file
 
 if TYPE_CHECKING:
@@ -54,9 +54,9 @@ class Annotate(SessionOptions):
         with ExitStack() as opened:
             opened.enter_context(listener)
             if self.out is not None:
-                made_folder(self.out)
+                create_folder(self.out)
             if self.observation is not None:
-                with writing(self.observation):
+                with guard_writing(self.observation):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)
             access = Access(listener.getsockname()[1])
             files = find_session_files(self)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import tyro
 
 from cadalign.errors import CadalignError
-from cadalign.io.files import finite, made_folder, refuse_folder
+from cadalign.io.files import create_folder, finite, refuse_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -135,10 +135,10 @@ def print_table(table: ConsoleTable) -> None:
         console.print(table.note)
 
 
-def make_folder_of(file: Path) -> None:
+def create_parent(file: Path) -> None:
     """Create the folder of an output file; raises DataError on failure, or for a folder."""
     refuse_folder(file)
-    made_folder(file.absolute().parent)
+    create_folder(file.absolute().parent)
 
 
 def path_beside(given: Path, ending: str) -> Path:

@@ -15,7 +15,7 @@ import tyro
 from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
 from cadalign.cli.options import name_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
-from cadalign.evaluation.experiments.keypointnet import DemoOptions
+from cadalign.evaluation.experiments.demo import DemoOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named
@@ -50,7 +50,7 @@ class RunCommand(JsonOption, RunOptions):
 
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run and show its progress; returns its specification and its tables."""
-        from cadalign.evaluation.api import prepared
+        from cadalign.evaluation.api import prepare
         from cadalign.evaluation.runs.engine import execute
 
         kind = self.options_type
@@ -58,7 +58,7 @@ class RunCommand(JsonOption, RunOptions):
         with redirect_stdout(sys.stderr), name_flags(self, sweep="SWEEP"):
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
             folder = RunFolder(self.out or Path("runs") / options.run_name)
-            plan, pool = prepared(options, folder, workers=self.workers, dask=self.dask)
+            plan, pool = prepare(options, folder, workers=self.workers, dask=self.dask)
         label = f"{kind.command.removesuffix('e')}ing"
         with redirect_stdout(sys.stderr), run_progress(label) as on_progress:
             execute(plan, folder, workers=pool, on_progress=on_progress)
@@ -176,12 +176,12 @@ def write_example(folder: Path) -> None:
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.mesh import Mesh
     from cadalign.geometry.rotations import rotation_from_vector
-    from cadalign.io.files import made_folder, write_json
+    from cadalign.io.files import create_folder, write_json
     from cadalign.io.images import write_image
     from cadalign.io.meshes.files import write_mesh
     from cadalign.render import RaycastRenderer, Scene
 
-    made_folder(folder)
+    create_folder(folder)
     mesh = Mesh(np.array(KEYPOINTS + _FEET), np.array(_FACES))
     write_mesh(folder / "chair.obj", mesh, kind="obj")
     named = tuple(map(ModelKeypoint, NAMES, KEYPOINTS))

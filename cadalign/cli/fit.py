@@ -15,8 +15,8 @@ from cadalign.cli.common import answer, path_beside, say, show_status
 from cadalign.cli.options import CameraOptions, ManyCommand, name_flags
 from cadalign.errors import DataError
 from cadalign.export.aligned_object import AlignedObject, export_object, format_of
-from cadalign.io.documents import in_file, read_json
-from cadalign.io.files import keeping, made_folder, write_text
+from cadalign.io.documents import name_file, read_json
+from cadalign.io.files import create_folder, protect_inputs, write_text
 from cadalign.io.images import write_image
 from cadalign.io.kinds import FIT
 
@@ -35,8 +35,9 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
     observation file. Prints the alignment and how well each piece of evidence agrees with it.
     Writes fit.json and one picture per view: overlay.png, overlay_1.png and so on.
 
-    Several observations are aligned as a run. It writes results.parquet and results.csv, with a row
-    per observation, and report.html. A killed run continues when the same command is started again.
+    Several observations, or a detector's file even of one object, are aligned as a run. Instead of
+    fit.json it writes results.parquet and results.csv, with a row per observation, and report.html.
+    A killed run continues when the same command is started again.
 
     Exit codes of a run: 0 all aligned, 3 some failed, 1 all failed or the input was refused, 2
     wrong command line.
@@ -68,7 +69,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
                 return run_command(self, options, done="aligned")
             how.check()
             seen = how.read(data, str(path), folder=path.parent, changes=self.changes)
-            seen = how.changed(seen)
+            seen = how.override(seen)
             with show_status("fitting"):
                 result = how.fit(seen, str(path), note=say)
         self._write(path, seen, result)
@@ -78,11 +79,11 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
         """Draw, write and print the result of a fit."""
         pictures = draw_views(seen, result) if self.picture else []
         out = self.out or path_beside(path, "_fit")
-        made_folder(out)
+        create_folder(out)
         fitted = seen.to_dict(folder=out.absolute())
         text = json.dumps(result.to_dict() | {"observation": fitted}, indent=2) + "\n"
         paths = [out / f"overlay{f'_{row}' if row else ''}.png" for row in range(len(pictures))]
-        with keeping([path, *seen.files]):
+        with protect_inputs([path, *seen.files]):
             write_text(out / "fit.json", text)
             for each, picture in zip(paths, pictures, strict=True):
                 write_image(each, picture)
@@ -155,7 +156,7 @@ class Export:
         if not isinstance(data, dict) or not isinstance(data.get("observation"), dict):
             what = "the file holds no fit with its observation"
             raise DataError(what, where=str(fit), fix="give the fit.json of `cadalign fit`")
-        with in_file(fit):
+        with name_file(fit):
             seen = Observation.from_dict(data["observation"], folder=fit.parent, needs_xyz=False)
             result = Result.from_dict(data)
             if result.method == "align" and seen.shape is not None:

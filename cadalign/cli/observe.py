@@ -9,16 +9,16 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.common import answer, make_folder_of, say
+from cadalign.cli.common import answer, create_parent, say
 from cadalign.cli.options import CameraOptions, name_flags
 from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
 from cadalign.datasets.coco import decode_segmentation
-from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in
+from cadalign.datasets.image_keypoints import ImageKeypoints, observe_keypoints
 from cadalign.errors import DataError
 from cadalign.geometry.calibration import camera_doubts
-from cadalign.io.documents import in_file
+from cadalign.io.documents import name_file
 from cadalign.io.evidence import ImageEvidence
-from cadalign.io.files import keeping
+from cadalign.io.files import protect_inputs
 from cadalign.io.images import write_image
 from cadalign.io.meshes.files import check_keypoints
 from cadalign.io.observation import Observation
@@ -55,12 +55,12 @@ class Observe(CameraOptions):
         """Write the observation; returns the exit code."""
         objects = read_image_keypoints(self.keypoints)
         model = ModelKeypoints.load(self.model)
-        with in_file(self.model):
+        with name_file(self.model):
             check_keypoints(model.xyz, model.model, where="keypoints.xyz")
         name = None if self.image is None else str(self.image)
         with name_flags(self):
             found = choose_object(objects, image=name, number=self.object)
-            observation = observed_in(
+            observation = observe_keypoints(
                 found,
                 model,
                 self.changes,
@@ -69,14 +69,14 @@ class Observe(CameraOptions):
                 ignore_unknown=self.ignore_unknown,
             )
         out = self.out or self.keypoints.with_suffix(".observation.json")
-        with keeping([self.keypoints, self.model, model.model, self.camera, self.image]):
-            make_folder_of(out)
+        with protect_inputs([self.keypoints, self.model, model.model, self.camera, self.image]):
+            create_parent(out)
             if found.segmentation is not None:
                 mask = self._write_mask(observation, found, out.with_suffix(".mask.png"))
                 observation = replace(observation, evidence=ImageEvidence(mask=mask))
             observation.save(out)
         called = found.image or ""
-        if name is not None and Path(called).suffix and not found.is_of(name):
+        if name is not None and Path(called).suffix and not found.matches_photo(name):
             say(f"{self.keypoints} names the photo {called}; its keypoints are used for {name}")
         if observation.not_found:
             say(f"{found.source}: {observation.text_of_not_found}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cadalign.cli.common import make_folder_of, say
+from cadalign.cli.common import create_parent, say
 from cadalign.cli.options import name_flags
 from cadalign.errors import InputError
 from cadalign.io.images import JPEG_ENDING
@@ -60,7 +60,7 @@ class Render:
                     visible = visible_keypoints(scene, xyz, camera, pose)
                     picture = keypoint_picture(picture, camera, xyz, pose, visible)
                 pictures[name] = picture
-            make_folder_of(self.out)
+            create_parent(self.out)
             write_image(self.out, contact_sheet(pictures) if len(pictures) > 1 else picture)
         say(f"Written: {self.out}")
         return 0

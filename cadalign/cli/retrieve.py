@@ -12,8 +12,8 @@ import tyro
 
 from cadalign.cli.common import (
     answer,
+    create_parent,
     group_of,
-    make_folder_of,
     print_json,
     print_table,
     say,
@@ -22,7 +22,7 @@ from cadalign.cli.common import (
 from cadalign.cli.options import CameraOptions, ManyCommand, name_flags
 from cadalign.errors import DataError, refuse_unused
 from cadalign.estimation.options import Sigma
-from cadalign.io.files import keeping, made_folder, refuse_input, require_utf8
+from cadalign.io.files import create_folder, protect_inputs, refuse_input, require_utf8
 from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
@@ -84,7 +84,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 options = RetrieveRunOptions(estimate=how, **inputs_of(self))
                 return run_command(self, options, done="retrieved")
             query = how.read(data, str(path), folder=path.parent, changes=self.changes)
-            return self._retrieve(how.with_ids(query, str(path)), path, how)
+            return self._retrieve(how.resolve_ids(query, str(path)), path, how)
 
     def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
         """Retrieve the models of one observation; returns the exit code."""
@@ -104,8 +104,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
             if absent is not None:
                 say(absent)
         if self.out is not None:
-            made_folder(self.out)
-            with keeping([path, *query.files, self.library]):
+            create_folder(self.out)
+            with protect_inputs([path, *query.files, self.library]):
                 sheet = write_retrieval(self.out, matches, query, image=photo)
             say(f"Pictures: {sheet}")
         return 0
@@ -169,9 +169,9 @@ class LibraryBuild:
             dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
             dataset = dataset.subset(categories=self.categories, split=self.split)
             files, total = dataset.files, len(dataset.ids())
-        with keeping(files), show_status(f"reading {total:,} models"):
+        with protect_inputs(files), show_status(f"reading {total:,} models"):
             refuse_input(self.out)
-            make_folder_of(self.out)
+            create_parent(self.out)
             if dataset is None:
                 library = Library.from_folder(self.root)
             else:
@@ -204,7 +204,7 @@ class LibraryShow:
 def _describe(library: Library) -> str:
     counts = Counter(category for category, _ in library.keys)
     listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
-    without = len(library) - library.with_mesh
+    without = len(library) - library.mesh_count
     text = f"{len(library)} models: {listed}" + (f"; {without} without a mesh" if without else "")
     return f"{text}\nKeypoints: {', '.join(library.names)}" if library.names else text
 

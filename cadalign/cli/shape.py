@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.common import answer, group_of, make_folder_of, say, show_status
+from cadalign.cli.common import answer, create_parent, group_of, say, show_status
 from cadalign.cli.options import name_flags
 from cadalign.datasets import KeypointNet
-from cadalign.io.files import keeping, refuse_input
+from cadalign.io.files import protect_inputs, refuse_input
 from cadalign.shapes.pretrained import CATEGORIES
 
 if TYPE_CHECKING:
@@ -41,10 +41,10 @@ class ShapeLearn:
     def run(self) -> int:
         """Learn the model; returns the exit code."""
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
-        with keeping(dataset.files), name_flags(self):
+        with protect_inputs(dataset.files), name_flags(self):
             if self.out is not None:
                 refuse_input(self.out)
-                make_folder_of(self.out)
+                create_parent(self.out)
             return self._learn(dataset)
 
     def _learn(self, dataset: KeypointNet) -> int:

@@ -17,7 +17,7 @@ try:
 except (ImportError, AttributeError):  # this version of Numba lacks a private name
     KernelDispatcher = None  # type: ignore[assignment, misc]
 
-__all__ = ["borrowing", "fast_sums", "inlined", "kernel", "kernel_family", "unrolled"]
+__all__ = ["borrow", "fast_sums", "inline", "kernel", "kernel_family", "unrolled"]
 
 unrolled = numba.literal_unroll
 """Iterate over a tuple of mixed types; the loop body is compiled for each type."""
@@ -39,12 +39,12 @@ def fast_sums(function: F) -> F:
     return _compile(function, fastmath={"reassoc"})
 
 
-def inlined(function: F) -> F:
-    """Like `borrowing`, for a small function that is always inlined into its callers."""
+def inline(function: F) -> F:
+    """Like `borrow`, for a small function that is always inlined into its callers."""
     return _compile(function, forceinline=True, counts=False)
 
 
-def borrowing(function: F) -> F:
+def borrow(function: F) -> F:
     """Like `kernel`, without reference counts, for a function that allocates no array.
 
     It must not return an array either. Numba counts references with atomic operations: a hundred

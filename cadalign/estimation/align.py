@@ -30,14 +30,14 @@ from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.problem import Problem, compile_problem, no_pose_error
-from cadalign.estimation.problems import each_of, pack_one
+from cadalign.estimation.problems import entry_per_problem, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, NO_NOTES, FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import search, widen_by_noise
 from cadalign.estimation.view import View, number_views
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import turned_alignment
+from cadalign.geometry.camera import rotate_alignment
 from cadalign.io.evidence import Size
 from cadalign.io.focal import PriorOption
 from cadalign.shapes.model import ShapeModel
@@ -125,7 +125,7 @@ def align(
         require_kind(size, Size, "size")
     inits = _checked_inits(init, given)
     options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
-    Lenses.of(given, focal, focal_prior)  # checks the cameras
+    Lenses.from_views(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
     if size is None and init is None and _is_plain(model, given):
         exact = cast(Model, model)
@@ -212,7 +212,7 @@ def _align_single(problem: Problem, start: float) -> Result:
     model, view, options = cast(ShapeModel, problem.model), problem.views[0], problem.options
     prior, init = problem.prior, problem.inits[0]
     if init is not None:
-        init = turned_alignment(init, problem.turns[0].T)
+        init = rotate_alignment(init, problem.turns[0].T)
     rows = prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")
     weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
@@ -303,7 +303,7 @@ def align_batch(
     [1.0, 2.0]
     """
     threads = worker_count(workers)
-    objects = each_of(objects, "objects", None, "views")
+    objects = entry_per_problem(objects, "objects", None, "views")
     sizes = _repeat(size, len(objects), "size", Size, "objects")
     starts = _repeat(init, len(objects), "init", Alignment, "objects")
 

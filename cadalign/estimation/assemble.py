@@ -15,8 +15,8 @@ from cadalign.estimation.result_parts import (
     Posterior,
     ViewResult,
     Warnings,
+    create_unchecked,
     keypoint_summary,
-    quickly,
 )
 from cadalign.geometry.symmetry import Symmetry
 
@@ -79,7 +79,7 @@ def result_of_keypoints(
         "diagnosis": diagnosis,
         "fisher_covariance": fitted.fisher_covariance,
     }
-    posterior = quickly(KeypointPosterior, of_posterior)
+    posterior = create_unchecked(KeypointPosterior, of_posterior)
     of_view = {
         "camera": fitted.camera,
         "alignment": fitted.alignment,
@@ -90,7 +90,7 @@ def result_of_keypoints(
         "posterior": posterior,
     }
     of_result = {
-        "views": (quickly(ViewResult, of_view),),
+        "views": (create_unchecked(ViewResult, of_view),),
         "ids": rows if model is None else model.ids,
         "points_3d": points,
         "method": fitted.method,
@@ -107,7 +107,7 @@ def result_of_keypoints(
         "model": model,
         "own_bounds": bounds,
     }
-    return quickly(Result, of_result)
+    return create_unchecked(Result, of_result)
 
 
 def _canonical(
@@ -126,19 +126,19 @@ def _canonical(
     if covariance is not None:
         covariance = transform_covariance(covariance, fitted.alignment, best, held)
     alternatives = tuple(
-        replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
+        replace(each, alignment=equal.alignment, points_3d=equal.map_points(each.points_3d))
         for k, equal in others
         for each in [fitted.alternatives[k - 1]]
     )
     same = replace(
         fitted,
         alignment=best.alignment,
-        points_3d=best.relabelled(fitted.points_3d),
+        points_3d=best.map_points(fitted.points_3d),
         fisher_covariance=covariance,
         symmetry=symmetry,
         alternatives=alternatives,
     )
-    return same, best.relabelled(points)
+    return same, best.map_points(points)
 
 
 @lru_cache(maxsize=64)

@@ -24,7 +24,7 @@ from cadalign.estimation.uncertainty.residuals import (
     share_as_moderate,
 )
 from cadalign.geometry.alignment import Alignment, describe_plane
-from cadalign.geometry.camera import faced, turned_poses
+from cadalign.geometry.camera import face_pixels, rotate_poses
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
 from cadalign.solvers.evidence import KeypointEvidence
@@ -204,7 +204,7 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
     order = np.random.default_rng(ransac.seed).permutation(count)
     if len(confidence):
         confidence = np.cumsum(confidence[order])
-    facing = faced(camera, problems.points_2d)
+    facing = face_pixels(camera, problems.points_2d)
     facing.require_focal()
     rays = rays_of(problems.points_2d[order], facing, clips=True)
     whitening_of(options.sigma, rays, facing)  # checks sigma
@@ -236,10 +236,10 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
             where="points_3d",
             fix="omit ransac: use loss='cauchy', with stretch= or stretch_sigma=",
         )
-    pose = turned_poses(pose, facing.lens_from_camera)
+    pose = rotate_poses(pose, facing.lens_from_camera)
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
-    return Alignment.from_packed(pose), kept, int(iterations), int(hypotheses), float(score)
+    return Alignment.from_vector(pose), kept, int(iterations), int(hypotheses), float(score)
 
 
 def _confidence(scores: npt.ArrayLike | None, count: int) -> FloatArray:

@@ -209,7 +209,7 @@ def _resize(view: View, *, size: tuple[int, int], noise: float) -> View:
     sigma, power = view.sigma, 2 if np.ndim(cast(FloatArray, view.sigma)) == 3 else 1
     if sigma is not None:
         sigma = np.asarray(sigma) * noise**power
-    return replace(view, camera=view.camera.resized(*size), sigma=sigma)
+    return replace(view, camera=view.camera.resize(*size), sigma=sigma)
 
 
 def _scale_measure(view: View, *, name: str, factor: float) -> View:

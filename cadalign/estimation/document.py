@@ -35,7 +35,7 @@ from cadalign.io.documents import (
     Point3,
     Positive,
     convert,
-    within,
+    name_part,
 )
 from cadalign.io.focal import FocalPrior
 
@@ -185,7 +185,7 @@ _VALUES: Mapping[str, Callable[[Any], Any]] = {
     "points_2d": _pixels,
     "inliers": partial(np.array, dtype=bool),
     "points_3d": lambda rows: np.array(rows).reshape(-1, 3),
-    **{name: within(name)(Alignment.from_dict) for name in ("alignment", "rig_from_model")},
+    **{name: name_part(name)(Alignment.from_dict) for name in ("alignment", "rig_from_model")},
     **dict.fromkeys(("own_bounds", "own_stretch"), np.array),
     **dict.fromkeys(_OF_POINTS, lambda rows: np.array(rows).reshape(-1, 3, 3)),
 }
@@ -213,10 +213,10 @@ def _result(read: _Result) -> dict[str, Any]:
     unknowns = 10 if read.focal == "estimate" else 9
     views, alternatives = [], []
     for number, view in enumerate(read.views):
-        with within(f"views[{number}]"):
+        with name_part(f"views[{number}]"):
             views.append(_view(view, unknowns))
     for number, other in enumerate(read.alternatives):
-        with within(f"alternatives[{number}]"):
+        with name_part(f"alternatives[{number}]"):
             alternatives.append(Alternative(**_values(other)))
     fields = _values(read)
     del fields["version"]

@@ -23,7 +23,7 @@ from cadalign.estimation.symmetry import (
 )
 from cadalign.estimation.uncertainty.residuals import loss_weights, whitening_matrices
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
+from cadalign.geometry.camera import Camera, rotate_alignment, rotate_covariance
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import by_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Equal, Symmetry
@@ -156,16 +156,16 @@ class Estimate(NamedTuple):
     """An estimate: points (m, 3), the box's corners last, poses, and covariances.
 
     Poses, covariances (9, 9) and cameras are given for each view that takes part, in the frames of
-    the given cameras. ``of_points`` (m, 3, 3) are covariances of the points in the model's frame,
-    ``of_seen`` in the first camera's frame, including the pose.
+    the given cameras. ``points_covariance`` (m, 3, 3) are covariances of the points in the model's
+    frame, ``points_cam_covariance`` in the first camera's frame, including the pose.
     """
 
     points: FloatArray
     scale: FloatArray
     poses: tuple[Alignment, ...]
     covariances: tuple[FloatArray, ...]
-    of_points: FloatArray
-    of_seen: FloatArray
+    points_covariance: FloatArray
+    points_cam_covariance: FloatArray
     likelihood: float = 1.0
     cameras: tuple[Camera, ...] = ()
     is_optimum: bool = False
@@ -184,9 +184,9 @@ def undo_turns(estimate: Estimate, problem: Problem) -> Estimate:
         return estimate
     wide = [problem.given[number].camera for number in numbers]
     return estimate._replace(
-        poses=tuple(map(turned_alignment, estimate.poses, turns)),
-        covariances=tuple(map(turned_covariance, estimate.covariances, turns)),
-        of_seen=first @ estimate.of_seen @ first.T,
+        poses=tuple(map(rotate_alignment, estimate.poses, turns)),
+        covariances=tuple(map(rotate_covariance, estimate.covariances, turns)),
+        points_cam_covariance=first @ estimate.points_cam_covariance @ first.T,
         cameras=tuple(
             given if given.is_wide else own
             for given, own in zip(wide, estimate.cameras, strict=True)
@@ -239,7 +239,7 @@ def _transform(estimate: Estimate, best: Equal) -> Estimate:
         equal = replace(best, alignment=pose if poses else best.alignment)
         poses.append(equal.alignment)
         covariances.append(remove_free_turns(transform_covariance(covariance, given, equal), equal))
-    points = best.relabelled(estimate.points)
+    points = best.map_points(estimate.points)
     entries = np.abs(turn)
     if (np.minimum(entries, 1 - entries) > _ALONG_AXES).any():
         points[-2:] = estimate.points[-2:]  # a turned box would not be axis-aligned
@@ -250,7 +250,7 @@ def _transform(estimate: Estimate, best: Equal) -> Estimate:
         scale=scale,
         poses=tuple(poses),
         covariances=tuple(covariances),
-        of_points=turn.T @ estimate.of_points @ turn,
+        points_covariance=turn.T @ estimate.points_covariance @ turn,
     )
 
 
@@ -261,7 +261,7 @@ def linearise(
     count, matrices = len(points), whitening_matrices(seen.whitening)
     rays = perspective(points @ pose.linear.T + pose.translation)
     errors = (matrices @ (rays - seen.rays)[:, :, None])[:, :, 0]
-    by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :POSE_UNKNOWNS]
+    by_pose = matrices @ ray_derivatives(points, pose.vector)[:, :, :POSE_UNKNOWNS]
     weights = loss_weights((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     roots = np.sqrt(weights)[:, None]
     by_pose *= roots[..., None]

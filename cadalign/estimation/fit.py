@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, copied
+from cadalign.arrays import FloatArray, copy_argument
 from cadalign.errors import CadalignError, InputError, NoConsensusError, require_kind
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import (
     Problems,
-    each_of,
+    entry_per_problem,
     first_rows,
-    in_threads,
     join_problems,
     pack_many,
     pack_one,
+    run_in_threads,
 )
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import EstimateWarning, FittedKeypoints
@@ -63,7 +63,7 @@ def fit(
         The same keypoints in the image [px]; integers are pixel centres.
     camera : Camera
         The calibrated camera, with its lens distortion. With ``focal="estimate"`` its focal length
-        is ignored: `Camera.without_focal` has none.
+        is ignored: `Camera.drop_focal` has none.
     method : {"optimal", "aepnp", "aepnp-paper", "epnp"}
         - ``optimal``: global search for the maximum-likelihood alignment; at least 5 points. With
           4 points, all alignments that reproject exactly, the least stretched first.
@@ -92,7 +92,7 @@ def fit(
         estimated.
     focal_prior : FocalPrior, "usual" or None
         Prior on the estimated focal length, for example from `FocalPrior.from_exif`. The default
-        covers usual lenses, see `FocalPrior.of_usual_lenses`. None for no prior.
+        covers usual lenses, see `FocalPrior.from_size`. None for no prior.
     ransac : RansacOptions, optional
         Robust search, for keypoints with outliers: find the alignment with the most inliers, then
         fit to these. ``result.inliers`` marks them. For an unknown focal length
@@ -131,7 +131,7 @@ def fit(
 
     The same photo without its focal length, which is 150 px:
 
-    >>> camera = Camera.without_focal(640, 480)
+    >>> camera = Camera.drop_focal(640, 480)
     >>> unknown = {"focal": "estimate", "focal_prior": None}
     >>> result = fit(problem.points_3d, problem.points_2d, camera, **unknown)
     >>> round(result.camera.fx, 3)
@@ -144,7 +144,7 @@ def fit(
     except InputError:
         raise
     except (TypeError, ValueError):  # an array as sigma has no hash
-        options = FitOptions(method, copied(sigma), *chosen[2:])
+        options = FitOptions(method, copy_argument(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
     check_search(ransac, scores, symmetry)
     return fit_one(problems, options, ransac, scores, symmetry, start)
@@ -324,14 +324,14 @@ def fit_batch(
     count = len(problems)
     each_options = [options] * count
     if per_problem:
-        sigmas = list(map(copied, each_of(sigma, "sigma", count, "values")))
+        sigmas = list(map(copy_argument, entry_per_problem(sigma, "sigma", count, "values")))
         for one, problem in zip(sigmas, problems, strict=True):
             if one is not None:
                 pixel_information(one, len(problem.points_3d))
         each_options = [replace(options, sigma=one) for one in sigmas]
     check_search(ransac, scores, symmetry)
     if scores is not None:
-        scores = each_of(scores, "scores", count, "sets")
+        scores = entry_per_problem(scores, "scores", count, "sets")
     is_alone = per_problem or ransac is not None or symmetry is not None
     is_alone |= not are_solved_at_once(problems, options) or any(map(first_rows, problems))
     entries: list[Any] = [None] * count
@@ -351,7 +351,7 @@ def fit_batch(
         else:
             entries[first:last], table[first:last] = _solve_at_once(problems[first:last], options)
 
-    in_threads(run, count, workers)
+    run_in_threads(run, count, workers)
     return Results(entries, None if is_alone else table)
 
 

@@ -48,8 +48,8 @@ from cadalign.estimation.result_parts import (
     ViewResult,
     Warnings,
     alternatives_of,
+    create_unchecked,
     keypoint_summary,
-    quickly,
 )
 from cadalign.estimation.search import Minimum, search
 from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
@@ -113,8 +113,8 @@ def result_of(
     pose, points = best.poses[0], best.points[:-2]
     places = np.array([each.points * each.scale for each in estimates])
     seen = np.array([each.poses[0].apply(each.points) for each in estimates])
-    of_points = second_moments(estimates, [each.of_points for each in estimates], places)
-    of_seen = second_moments(estimates, [each.of_seen for each in estimates], seen)
+    of_points = second_moments(estimates, [each.points_covariance for each in estimates], places)
+    of_seen = second_moments(estimates, [each.points_cam_covariance for each in estimates], seen)
     of_views, summaries = [], list(evidence)
     known = dict(zip((views[k].camera for k in numbers), best.cameras, strict=True))
     for number, view in enumerate(views):
@@ -269,7 +269,7 @@ def add_diagnosis(
     causes = partial(_causes, result, diagnosis, views, ransac)
     known = vars(result.posterior) | {"causes": causes, "stated": result.warnings}
     known.pop("warnings")
-    return replace(result, posterior=quickly(DiagnosedPosterior, known))
+    return replace(result, posterior=create_unchecked(DiagnosedPosterior, known))
 
 
 def _causes(

@@ -195,7 +195,7 @@ class Lenses:
     prior: PriorOption = None
 
     @classmethod
-    def of(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
+    def from_views(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
         """The views' lenses; only focal lengths of views with evidence are estimated."""
         cameras = tuple(view.camera for view in views)
         if focal == "known":
@@ -211,7 +211,7 @@ class Lenses:
         for camera in cameras:
             grid, own = focal_grid(camera, prior), prior_of_camera(prior, camera)
             known = own.focal if own is not None else float(grid[len(grid) // 2])
-            reference.append(camera.with_focal(known))
+            reference.append(camera.replace_focal(known))
         groups = [distinct.index(each) if each in distinct else -1 for each in cameras]
         return cls(tuple(reference), tuple(groups), prior)
 
@@ -238,11 +238,11 @@ class Lenses:
     def cameras_at(self, log_focals: FloatArray) -> list[Camera]:
         """The cameras of all views at log focal lengths (F,), relative to the references."""
         return [
-            camera if group < 0 else camera.with_focal(camera.fx * math.exp(log_focals[group]))
+            camera if group < 0 else camera.replace_focal(camera.fx * math.exp(log_focals[group]))
             for camera, group in zip(self.cameras, self.groups, strict=True)
         ]
 
-    def at(self, log_focals: FloatArray) -> Lenses:
+    def replace_focals(self, log_focals: FloatArray) -> Lenses:
         """Lenses with new references at log focal lengths (F,), relative to the old ones."""
         return replace(self, cameras=tuple(self.cameras_at(log_focals)))
 
@@ -258,4 +258,4 @@ def camera_like(camera: Camera, estimated: Mapping[Camera, Camera]) -> Camera:
         return estimated.get(camera, camera)
     first = next(iter(estimated.values()))
     side = max(camera.width, camera.height) / max(first.width, first.height)
-    return camera.with_focal(first.fx * side)
+    return camera.replace_focal(first.fx * side)

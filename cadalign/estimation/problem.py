@@ -23,7 +23,7 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import Lenses, ShapePrior, prior_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment, are_on_a_line
-from cadalign.geometry.camera import faced, needs_facing, rays_ahead
+from cadalign.geometry.camera import face_pixels, needs_facing, rays_ahead
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LEAST_POINTS
@@ -127,7 +127,7 @@ def compile_problem(
         for view in facing:
             if view.camera.is_wide:
                 rays_ahead(view.pixels, view.camera)
-    lenses = Lenses.of(facing, options.focal, options.focal_prior)
+    lenses = Lenses.from_views(facing, options.focal, options.focal_prior)
     turns = tuple(
         np.eye(3) if own is view else own.camera.lens_from_camera
         for own, view in zip(facing, views, strict=True)
@@ -174,7 +174,7 @@ def _drop_views_without_pose(problem: Problem) -> Problem:
             where="views[0]",
             fix="give at least 3 keypoints, not on one line, or another view first",
         )
-    lenses = Lenses.of(views, problem.options.focal, problem.options.focal_prior)
+    lenses = Lenses.from_views(views, problem.options.focal, problem.options.focal_prior)
     return problem._replace(views=tuple(views), lenses=lenses)
 
 
@@ -182,7 +182,7 @@ def _facing_view(view: View) -> View:
     """Turn the camera of a wide lens to the object; ``up`` and depths stay in the lens's frame."""
     if not needs_facing([view.camera]):
         return view
-    return replace(view, camera=faced(view.camera, _pixels_of_object(view)))
+    return replace(view, camera=face_pixels(view.camera, _pixels_of_object(view)))
 
 
 def _pixels_of_object(view: View) -> FloatArray:

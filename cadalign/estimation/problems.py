@@ -99,17 +99,19 @@ def pack_many(
     camera: Camera | Sequence[Camera],
 ) -> list[Problems]:
     """Check and pack many problems, of equal or different sizes."""
-    points_3d = each_of(points_3d, "points_3d", None, "")
+    points_3d = entry_per_problem(points_3d, "points_3d", None, "")
     count = len(points_3d)
-    points_2d = each_of(points_2d, "points_2d", count, "sets of image points")
+    points_2d = entry_per_problem(points_2d, "points_2d", count, "sets of image points")
     is_shared = isinstance(camera, Camera)
-    cameras = [camera] * count if is_shared else each_of(camera, "camera", count, "cameras")
+    cameras = (
+        [camera] * count if is_shared else entry_per_problem(camera, "camera", count, "cameras")
+    )
     places = [f"[{b}]" for b in range(count)]
     given = zip(points_3d, points_2d, cameras, places, strict=True)
     return [pack_one(*arguments) for arguments in given]
 
 
-def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
+def entry_per_problem(value: Any, name: str, count: int | None, entries: str) -> Any:
     """A sequence with one entry per problem; messages call them ``entries``."""
     try:
         each = value if isinstance(value, np.ndarray) and value.ndim else list(value)
@@ -121,7 +123,7 @@ def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
     return each
 
 
-def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T]:
+def run_in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T]:
     """Run ``run(first, last)`` over parts of ``count`` problems in threads."""
     bounds = np.linspace(0, count, min(worker_count(workers), max(count, 1)) + 1).astype(int)
     parts = list(pairwise(bounds.tolist()))

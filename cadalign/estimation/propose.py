@@ -43,7 +43,7 @@ def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts
         return lenses, _starts_at(problem, problem.evidence(shape, lenses), init)
     found: list[_FocalStarts] = []
     for log_focals in lenses.grid():
-        there = lenses.at(log_focals)
+        there = lenses.replace_focals(log_focals)
         evidence = problem.evidence(shape, there)
         starts = _starts_at(problem, evidence, init)
         one = starts.poses.shape[1] == 1

@@ -430,12 +430,12 @@ class Result:
         DataError
             If the file cannot be read, or a field is missing or invalid; the message names both.
         """
-        from cadalign.io.documents import in_file, read_json
+        from cadalign.io.documents import name_file, read_json
         from cadalign.io.kinds import FIT
 
         path = as_path(path)
         data = read_json(path, FIT)
-        with in_file(path):
+        with name_file(path):
             return cls.from_dict(data)
 
     def to_dict(self) -> dict[str, Any]:

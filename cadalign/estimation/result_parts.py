@@ -102,6 +102,7 @@ MISFIT_KINDS: frozenset[Kind] = frozenset({"misfit", "outlier", "stretch", "came
 
 T = TypeVar("T")
 
+_NO_RESIDUAL = 1e-6  # of a length that the estimate fits exactly [sigma]
 LEAST_LIKELIHOOD = 1e-3
 """Relative likelihood above which another minimum is reported as an alternative."""
 _FIELDS = {
@@ -154,7 +155,7 @@ def alternatives_of(
     return tuple(
         Alternative(pose, ratio, camera, points)
         for pose, ratio, camera in list(zip(poses, ratios, cameras, strict=True))[1:]
-        if ratio >= LEAST_LIKELIHOOD and np.isfinite(pose.packed).all()
+        if ratio >= LEAST_LIKELIHOOD and np.isfinite(pose.vector).all()
     )
 
 
@@ -271,6 +272,8 @@ class EvidenceSummary:
     def __str__(self) -> str:
         if self.share == 0:
             return f"{self.name}: left out"
+        if not self.unit and self.rms_sigmas < _NO_RESIDUAL:
+            return f"{self.name}: sets the unit of lengths"
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.name}: rms {self.rms:.3g}{unit}, {self.rms_sigmas:.2g} sigma"
 
@@ -298,7 +301,7 @@ def join_or(clauses: Sequence[str]) -> str:
     return f"{', '.join(some)} or {last}" if some else last
 
 
-def quickly(kind: type[T], fields: dict[str, Any]) -> T:
+def create_unchecked(kind: type[T], fields: dict[str, Any]) -> T:
     """Create a frozen dataclass without its slow constructor and checks."""
     made = object.__new__(kind)
     made.__dict__.update(fields)

@@ -13,7 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
-from cadalign.io.documents import in_file, parse_json
+from cadalign.io.documents import name_file, parse_json
 from cadalign.io.files import as_path
 from cadalign.solvers.constants import POSE_SIZE
 
@@ -82,7 +82,7 @@ class Results(Sequence[Result | CadalignError]):
         table = np.full((len(self), COLUMNS), np.nan)
         for k, each in enumerate(self):
             if isinstance(each, Result):
-                table[k] = *each.alignment.packed, each.rms, each.camera.fx
+                table[k] = *each.alignment.vector, each.rms, each.camera.fx
         return table
 
     @property
@@ -121,7 +121,7 @@ class Results(Sequence[Result | CadalignError]):
         entry = self._entries[problem]
         if isinstance(entry, CadalignError):
             raise entry
-        return Alignment.from_packed(self._table[problem, :POSE_SIZE].copy())
+        return Alignment.from_vector(self._table[problem, :POSE_SIZE].copy())
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row for each problem, as a pandas DataFrame with the columns of ``results.csv``.
@@ -199,5 +199,5 @@ class Results(Sequence[Result | CadalignError]):
 
 
 def _read_result(texts: Any, row: int, where: str) -> Result:
-    with in_file(where):
+    with name_file(where):
         return Result.from_dict(parse_json(texts[row].as_py(), "result"))

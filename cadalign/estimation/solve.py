@@ -23,9 +23,14 @@ from cadalign.estimation.problems import (
     solver_error,
     whitening_of,
 )
-from cadalign.estimation.result_parts import FitStats, FittedKeypoints, alternatives_of, quickly
+from cadalign.estimation.result_parts import (
+    FitStats,
+    FittedKeypoints,
+    alternatives_of,
+    create_unchecked,
+)
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, faced, turned_covariance, turned_poses
+from cadalign.geometry.camera import Camera, face_pixels, rotate_covariance, rotate_poses
 from cadalign.solvers.constants import OK, OUT_OF_RANGE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch, rigid_flag
@@ -48,7 +53,7 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
     """Solve all problems; a camera with distortion takes one. Raises CadalignError."""
     camera = problems.camera
     camera.require_focal()
-    facing = faced(camera, problems.points_2d) if camera.is_wide else camera
+    facing = face_pixels(camera, problems.points_2d) if camera.is_wide else camera
     points = problems.points_3d
     rays = rays_of(problems.points_2d, facing)
     whitening = whitening_of(options.sigma, rays, facing)  # checks sigma
@@ -67,9 +72,9 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
     }
     poses, covariances = found.poses, found.covariances
     if facing is not camera:
-        poses = turned_poses(poses[0], facing.lens_from_camera)[None]
+        poses = rotate_poses(poses[0], facing.lens_from_camera)[None]
         if covariances is not None:
-            covariances = turned_covariance(covariances, facing.lens_from_camera)
+            covariances = rotate_covariance(covariances, facing.lens_from_camera)
     return found._replace(
         poses=poses, covariances=covariances, residuals=residuals, statuses=statuses, errors=errors
     )
@@ -160,7 +165,7 @@ def keypoints_of_solution(
         "points_3d": points,
         "residuals": solutions.residuals,
         "inliers": inliers,
-        "alignment": Alignment.from_packed(solutions.poses[0, 0]),
+        "alignment": Alignment.from_vector(solutions.poses[0, 0]),
         "camera": problems.camera,
         "options": options,
         "sigma": float(cast(float, options.sigma)) if is_one else None,
@@ -172,12 +177,12 @@ def keypoints_of_solution(
         fitted["fisher_covariance"] = covariance
         fitted["cost"] = solutions.costs.item(0)
     if minima > 1:
-        poses = [Alignment.from_packed(pose) for pose in solutions.poses[0, :minima]]
+        poses = [Alignment.from_vector(pose) for pose in solutions.poses[0, :minima]]
         cameras, costs = [problems.camera] * minima, solutions.costs[0, :minima].tolist()
         fitted["alternatives"] = alternatives_of(points, poses, cameras, costs)
     effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
-    fitted["stats"] = quickly(FitStats, effort)
-    return quickly(FittedKeypoints, fitted)
+    fitted["stats"] = create_unchecked(FitStats, effort)
+    return create_unchecked(FittedKeypoints, fitted)
 
 
 def fit_keypoints(problems: Problems, options: FitOptions, start: float) -> FittedKeypoints:

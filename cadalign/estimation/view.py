@@ -19,7 +19,7 @@ from cadalign.arrays import (
     as_one_or_each,
     as_points,
     as_positive,
-    copied,
+    copy_argument,
     is_number,
     read_only,
 )
@@ -48,7 +48,7 @@ class View:
     Parameters
     ----------
     camera : Camera
-        The calibrated camera; `Camera.without_focal` where the focal length is to be estimated.
+        The calibrated camera; `Camera.drop_focal` where the focal length is to be estimated.
     points_2d : (n, 2) float
         Keypoints in the image [px]; integers are pixel centres.
     ids : sequence of n int or str, optional
@@ -145,7 +145,7 @@ class View:
         ids = checked_ids(self.ids, len(points)) if is_named else _Numbers(range(len(points)))
         object.__setattr__(self, "ids", ids)
         for name in ("sigma", "scores", "depth_sigma", "up_sigma_deg"):
-            object.__setattr__(self, name, copied(getattr(self, name)))
+            object.__setattr__(self, name, copy_argument(getattr(self, name)))
         if self.depth is not None:
             self._keep("depth", _depths(self.depth, camera, len(points), self.depth_scale))
             object.__setattr__(self, "depth_scale", None)  # a changed copy is not scaled again

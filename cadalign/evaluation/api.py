@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any
 
-from cadalign.errors import InputError, unknown
+from cadalign.errors import InputError, unknown_name
 from cadalign.evaluation.methods import check_names
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, as_tuples
 from cadalign.evaluation.registry import spec_named
@@ -104,7 +104,9 @@ def _check_options(
     own = {each.name: each for each in fields(kind) if each.init}
     for name in given:
         if name not in own:
-            raise unknown(f"option of {experiment}", name, sorted(own), where=f"evaluate({name}=)")
+            raise unknown_name(
+                f"option of {experiment}", name, sorted(own), where=f"evaluate({name}=)"
+            )
     placed = [each for each in own.values() if not each.kw_only]
     if len(source) > len(placed):
         raise InputError(f"{experiment} has no dataset", where="root", fix="leave it out")
@@ -125,11 +127,11 @@ def run(
 
     ``workers`` and ``dask`` are options of `evaluate`. ``on_progress`` is called after every chunk.
     """
-    plan, pool = prepared(options, folder, workers=workers, dask=dask)
+    plan, pool = prepare(options, folder, workers=workers, dask=dask)
     execute(plan, folder, workers=pool, on_progress=on_progress)
 
 
-def prepared(
+def prepare(
     options: ExperimentOptions, folder: RunFolder, *, workers: int | None, dask: str | None
 ) -> tuple[Plan[Any], Workers]:
     """Return the plan and the workers of `run`."""

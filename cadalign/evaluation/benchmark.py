@@ -114,7 +114,7 @@ class Benchmark:
     metrics: tuple[FunctionMetric, ...] = ()  # metrics of users' functions
 
     @classmethod
-    def of(
+    def from_methods(
         cls,
         setting: Setting,
         methods: Iterable[str],

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.arrays import BoolArray, FloatArray, is_number, is_real
-from cadalign.errors import CadalignError, InputError, quote, unknown
+from cadalign.errors import CadalignError, InputError, quote, unknown_name
 from cadalign.estimation.options import METHODS, RansacOptions
 from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import Function, is_function, name_of
@@ -57,7 +57,7 @@ class MethodInput:
     inliers: BoolArray | None = None  # (n,), true inliers, for the Cramer-Rao bound
 
     @classmethod
-    def of_problem(
+    def from_problem(
         cls, problem: SimulatedProblem, sigma: float, *, ransac: RansacOptions | None = None
     ) -> MethodInput:
         """The input of a simulated problem; ``sigma`` [px] is the noise as methods get it."""
@@ -271,7 +271,7 @@ def validate_methods(chosen: Iterable[Any], own: Collection[str] | None = None) 
         raise InputError("none is given", where="methods", fix=fix)
     for each in found:
         if not is_function(each) and each not in known:
-            raise unknown("method", each, known, where="methods")
+            raise unknown_name("method", each, known, where="methods")
     check_names(filter(is_function, found), known, "methods")
     for function in filter(is_function, found):
         _load(function, "methods")
@@ -290,7 +290,7 @@ class FunctionMetric:
     parameters: tuple[str, ...]
 
     @classmethod
-    def of(cls, function: Function) -> FunctionMetric:
+    def from_function(cls, function: Function) -> FunctionMetric:
         """Make a metric; raises InputError for an unknown required parameter."""
         if not is_function(function):
             raise InputError(f"{quote(function)} is no function", where="metrics", fix=_FIX)
@@ -299,7 +299,7 @@ class FunctionMetric:
         required = [p.name for p in parameters if p.default is p.empty and p.kind not in variable]
         others = [name for name in required if name not in _ARGUMENTS]
         if others:
-            raise unknown("parameter", others[0], _ARGUMENTS, where="metrics")
+            raise unknown_name("parameter", others[0], _ARGUMENTS, where="metrics")
         taken = tuple(each.name for each in parameters if each.name in _ARGUMENTS)
         return cls(metric_named(name_of(function)), function, taken)
 
@@ -337,6 +337,6 @@ def choose_metrics(
 
     Raises InputError if one is not a function, or has the name of one of the columns.
     """
-    found = tuple(FunctionMetric.of(each) for each in dict.fromkeys(functions))
+    found = tuple(FunctionMetric.from_function(each) for each in dict.fromkeys(functions))
     check_names((each.function for each in found), ("seconds", *dict(columns)), "metrics")
     return found

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, cast
 
 import tyro
 
-from cadalign.errors import InputError, unknown
+from cadalign.errors import InputError, unknown_name
 
 T = TypeVar("T")
 Function = str | Callable[..., Any]
@@ -69,7 +69,7 @@ class ExperimentOptions:
         for name, known in choices.items():
             value = getattr(self, name)
             if value not in known:
-                raise unknown("value", value, known, where=name)
+                raise unknown_name("value", value, known, where=name)
 
     def check_noise(self, *names: str) -> None:
         """Raise InputError for standard deviations that are negative or not finite."""

@@ -63,7 +63,7 @@ class Trace:
     y: list[float | None]
 
     @classmethod
-    def of(
+    def from_values(
         cls, run: int, method: str, x: Sequence[float], y: Sequence[float], unit: Metric
     ) -> Trace:
         """Make a line of values, which are converted to the metric's unit."""
@@ -109,7 +109,9 @@ def plot_against(
         for method in dict.fromkeys(each.method for each in summaries):
             rows = [each for each in summaries if each.method == method]
             places = [x.factor * each[place] for each in rows]
-            traces.append(Trace.of(index, method, places, [each[y.key] for each in rows], y))
+            traces.append(
+                Trace.from_values(index, method, places, [each[y.key] for each in rows], y)
+            )
     return Plot(**{"id": y.key, **words}, x=x, y=y, traces=traces)
 
 
@@ -172,7 +174,7 @@ def cumulative_plot(runs: Sequence[Run], metric: Metric, places: FloatArray, *, 
 
     shown = (metric.factor * places).tolist()
     traces = [
-        Trace.of(index, method, shown, shares(rows).tolist(), metrics.COVERED)
+        Trace.from_values(index, method, shown, shares(rows).tolist(), metrics.COVERED)
         for index, run in enumerate(runs)
         for method in run.methods
         for rows in [select_rows(run.cells, run.cells["method"] == method)]

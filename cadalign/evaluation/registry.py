@@ -13,13 +13,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cadalign.errors import DataError, InputError, quote, unknown
+from cadalign.errors import DataError, InputError, quote, unknown_name
 from cadalign.evaluation.metrics import CATEGORY, Metric, has_values
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plot
 from cadalign.evaluation.runs.work import COLUMNS, SKIPPED, Columns, Plan
 from cadalign.evaluation.summary import ConsoleTable, Summary, summary_csv
-from cadalign.io.files import made_folder, write_text
+from cadalign.io.files import create_folder, write_text
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
@@ -122,14 +122,14 @@ class Spec:
         names = {"value": self.group(run).key}
         write_text(run.folder.summary, summary_csv(summaries, rename=names))
         for plot in self.plots([run]):
-            draw_plot(made_folder(run.folder.figures) / plot.id, plot)
+            draw_plot(create_folder(run.folder.figures) / plot.id, plot)
         return summaries
 
 
 # In the order of help texts and messages.
 _EXPERIMENTS = {
     "keypointnet": "cadalign.evaluation.experiments.keypointnet:SPEC",
-    "demo": "cadalign.evaluation.experiments.keypointnet:DEMO",
+    "demo": "cadalign.evaluation.experiments.demo:SPEC",
     "simulate": "cadalign.evaluation.experiments.simulation:SPEC",
     "correspondences": "cadalign.evaluation.experiments.correspondences:SPEC",
     "retrieval": "cadalign.evaluation.experiments.retrieval:SPEC",
@@ -149,7 +149,7 @@ def spec_named(name: str) -> Spec:
     """The specification of an experiment."""
     place = (_EXPERIMENTS | BATCHES).get(name)
     if place is None:
-        raise unknown("experiment", name, list(_EXPERIMENTS))
+        raise unknown_name("experiment", name, list(_EXPERIMENTS))
     module, _, attribute = place.partition(":")
     spec: Spec = getattr(import_module(module), attribute or "SPEC")
     return spec

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import as_path, keeping, made_folder, printable, refuse_nul
+from cadalign.io.files import as_path, create_folder, printable, protect_inputs, refuse_nul
 from cadalign.io.meshes.files import write_mesh
 
 _SAME = 1e-6
@@ -131,8 +131,9 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     path = as_path(path)
     name = path.suffix.lower().removeprefix(".")
     if name not in FORMATS:
-        fix = f"give one that ends in {', '.join(f'.{each}' for each in FORMATS)}"
-        raise InputError("the name does not tell the format", where=printable(path), fix=fix)
+        fix = f"the formats are {', '.join(f'.{each}' for each in FORMATS)}"
+        what = f"the ending {quote(path.suffix)} is not an export format"
+        raise InputError(what, where=printable(path), fix=fix)
     return FORMATS[name]
 
 
@@ -162,7 +163,7 @@ def export_object(path: str | os.PathLike[str], exported: AlignedObject) -> Path
     path = as_path(path)
     refuse_nul(path)
     form = format_of(path)
-    made_folder(path.parent)
-    with keeping([*exported.sources, *(view.image for view in exported.views)]):
+    create_folder(path.parent)
+    with protect_inputs([*exported.sources, *(view.image for view in exported.views)]):
         form.write(path, exported)
     return path

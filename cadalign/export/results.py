@@ -65,7 +65,7 @@ def result_text(result: Any) -> str:
         exact = result.points_3d[result.inliers] if is_plain else result.points_3d[:0]
         names = [name + why_open(name, exact, pose) for name in result.uncertain]
         lines.append(f"  uncertain    {', '.join(names)}")
-    if len(result.evidence) > 1:
+    if [each.kind for each in result.evidence] != ["keypoints"]:
         lines.extend(f"  evidence     {each}" for each in result.evidence)
     lines.extend(f"  warning      {text}" for text in result.warnings)
     return "\n".join(lines)

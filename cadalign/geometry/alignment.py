@@ -86,14 +86,14 @@ class Alignment:
             object.__setattr__(self, name, read_only(value))
 
     @classmethod
-    def from_packed(cls, pose: FloatArray) -> Alignment:
+    def from_vector(cls, pose: FloatArray) -> Alignment:
         """Make an alignment from a packed pose (15,): rotation row by row, translation, scale."""
         pose = pose.copy()
         return cls(pose[:9].reshape(3, 3), pose[9:12], pose[12:], is_valid=True)
 
     @property
-    def packed(self) -> FloatArray:
-        """Packed pose, (15,) float; see `from_packed`."""
+    def vector(self) -> FloatArray:
+        """Packed pose, (15,) float; see `from_vector`."""
         return np.concatenate([self.rotation.ravel(), self.translation, self.scale])
 
     @classmethod
@@ -104,10 +104,10 @@ class Alignment:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Alignment):
             return NotImplemented
-        return bool((self.packed == other.packed).all())
+        return bool((self.vector == other.vector).all())
 
     def __hash__(self) -> int:
-        return hash(self.packed.tobytes())
+        return hash(self.vector.tobytes())
 
     @property
     def linear(self) -> FloatArray:

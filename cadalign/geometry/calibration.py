@@ -66,7 +66,7 @@ class Calibration:
     lens: LensKind = field(default="perspective", kw_only=True)
     focal_known: bool = field(default=True, kw_only=True, repr=False)
     turn: tuple[float, ...] = field(default=(), kw_only=True, repr=False)
-    """Rotation from a frame of `Camera.turned` to the lens's, by rows; empty if not turned."""
+    """Rotation from a frame of `Camera.rotate` to the lens's, by rows; empty if not turned."""
 
     def __post_init__(self) -> None:
         for name in _SIZE:
@@ -150,7 +150,7 @@ class Calibration:
         return cls(width, height, fx, fy, cx - shift, cy - shift, distortion, lens=lens)
 
     @classmethod
-    def without_focal(
+    def drop_focal(
         cls: type[_C],
         width: int,
         height: int,
@@ -167,10 +167,10 @@ class Calibration:
         Examples
         --------
         >>> from cadalign import Camera
-        >>> camera = Camera.without_focal(640, 480)
+        >>> camera = Camera.drop_focal(640, 480)
         >>> camera.cx, camera.cy, camera.focal_known
         (319.5, 239.5, False)
-        >>> camera.with_focal(700).fy
+        >>> camera.replace_focal(700).fy
         700.0
         """
         width, height = _whole_size(width, "width"), _whole_size(height, "height")
@@ -179,19 +179,19 @@ class Calibration:
         cy = (height - 1) / 2 if cy is None else cy
         return cls(width, height, focal, focal, cx, cy, distortion, focal_known=False)
 
-    def with_focal(self: _C, focal: float) -> _C:
-        """Set the focal length ``fx`` [px], which is then known; ``fy`` changes in proportion."""
+    def replace_focal(self: _C, focal: float) -> _C:
+        """Replace the focal length by ``fx`` [px], then known; ``fy`` changes in proportion."""
         if not is_number(focal):
             raise InputError(f"{quote(focal)} is not a finite number", where="focal")
         return replace(self, fx=focal, fy=focal * (self.fy / self.fx), focal_known=True)
 
-    def resized(self: _C, width: int, height: int) -> _C:
+    def resize(self: _C, width: int, height: int) -> _C:
         """Make the camera of the image resized to ``width`` x ``height`` pixels.
 
         Examples
         --------
         >>> from cadalign import Camera
-        >>> Camera(4, 2, fx=3, fy=3, cx=1.5, cy=0.5).resized(8, 4).cx
+        >>> Camera(4, 2, fx=3, fy=3, cx=1.5, cy=0.5).resize(8, 4).cx
         3.5
         """
         factors = np.array([width / self.width, height / self.height])
@@ -199,7 +199,7 @@ class Calibration:
         fx, fy = (factors * (self.fx, self.fy)).tolist()
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
-    def cropped(self: _C, left: int, top: int, width: int, height: int) -> _C:
+    def crop(self: _C, left: int, top: int, width: int, height: int) -> _C:
         """Make the camera of a crop of the image whose top-left pixel is (``left``, ``top``).
 
         The crop may reach beyond the image.
@@ -208,7 +208,7 @@ class Calibration:
         --------
         >>> from cadalign import Camera
         >>> camera = Camera(640, 480, fx=900, fy=900, cx=319.5, cy=239.5)
-        >>> part = camera.cropped(100, 50, 200, 300)
+        >>> part = camera.crop(100, 50, 200, 300)
         >>> part.cx, part.cy, part.width
         (219.5, 189.5, 200)
         """
@@ -223,7 +223,7 @@ class Calibration:
     def require_focal(self) -> None:
         """Raise an InputError if the focal length is unknown."""
         if not self.focal_known:
-            fix = 'estimate it with focal="estimate", or give it: camera.with_focal(...)'
+            fix = 'estimate it with focal="estimate", or give it: camera.replace_focal(...)'
             raise InputError("the focal length is unknown", where="camera", fix=fix)
 
     def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> BoolArray:
@@ -270,7 +270,7 @@ class Calibration:
             COLMAP's form, see `to_dict`: ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
             OPENCV, FULL_OPENCV or OPENCV_FISHEYE), ``width``, ``height``, and ``params`` in
             COLMAP's order. With None as focal lengths, or with ``width`` and ``height`` alone, the
-            camera is made by `without_focal`. The other form: ``matrix`` (3, 3), ``width``,
+            camera is made by `drop_focal`. The other form: ``matrix`` (3, 3), ``width``,
             ``height`` and optionally ``distortion`` and ``lens``, see `from_matrix`. Both forms
             accept ``pixel_origin``, by default ``"corner"`` with ``params`` and ``"center"`` with
             ``matrix``.
@@ -293,7 +293,7 @@ class Calibration:
         if not isinstance(data, Mapping):
             raise InputError(f"expected an object, got {type(data).__name__}", where="camera")
         if set(data) - {"pixel_origin"} == {"width", "height"}:
-            return cls.without_focal(data["width"], data["height"])
+            return cls.drop_focal(data["width"], data["height"])
         kind = "matrix" if "matrix" in data and "params" not in data else "params"
         missing = [key for key in _FORMS[kind] if key not in data]
         if missing:
@@ -305,7 +305,7 @@ class Calibration:
             return cls.from_matrix(**given)
         shift = shift_of(data.get("pixel_origin", "corner"), where="camera.pixel_origin")
         fields = _read_params(data["model"], data["params"], shift)
-        make = cls if "fx" in fields else cls.without_focal
+        make = cls if "fx" in fields else cls.drop_focal
         return make(width=data["width"], height=data["height"], **fields)
 
 
@@ -372,7 +372,7 @@ def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str,
         width, height = sizes[same[0]]
         found.append(
             f"{point} the middle of an image of {width:.0f} x {height:.0f} px, but the image "
-            f"has {size}: if the photo was resized, give its original camera.resized("
+            f"has {size}: if the photo was resized, give its original camera.resize("
             f"{camera.width}, {camera.height})"
         )
     elif np.abs(middle / own - 0.5).max() >= _FAR_FROM_MIDDLE:

@@ -52,7 +52,7 @@ class Camera(Calibration):
         Kind of lens. A fisheye may see points beside and behind the camera. Its focal length must
         be known.
     focal_known : bool
-        False if the focal lengths are placeholders; see `without_focal`.
+        False if the focal lengths are placeholders; see `drop_focal`.
 
     Raises
     ------
@@ -70,7 +70,7 @@ class Camera(Calibration):
     [[633.66, 319.5]]
     """
 
-    def turned(self, rotation: npt.ArrayLike) -> Camera:
+    def rotate(self, rotation: npt.ArrayLike) -> Camera:
         """Turn the frame of a camera with a wide lens about the camera centre.
 
         ``rotation`` (3, 3) maps this camera's frame to the new one. The image and the lens do not
@@ -84,7 +84,7 @@ class Camera(Calibration):
         Examples
         --------
         >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5, lens="fisheye")
-        >>> aside = camera.turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # z is the former x
+        >>> aside = camera.rotate([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # z is the former x
         >>> bool(np.allclose(aside.project([[0, 0, 1]]), camera.project([[1, 0, 0]])))
         True
         """
@@ -95,7 +95,7 @@ class Camera(Calibration):
 
     @property
     def lens_from_camera(self) -> FloatArray:
-        """Rotation (3, 3) from the camera's frame to the lens's frame; see `turned`."""
+        """Rotation (3, 3) from the camera's frame to the lens's frame; see `rotate`."""
         return np.array(self.turn).reshape(3, 3) if self.turn else np.eye(3)
 
     @property
@@ -287,7 +287,7 @@ _ROUNDS = 64
 _RESULT_UNKNOWNS = 10  # of a result's covariance, focal length included
 
 
-def faced(camera: Camera, points_2d: FloatArray) -> Camera:
+def face_pixels(camera: Camera, points_2d: FloatArray) -> Camera:
     """Turn a camera with a wide lens so that its z axis faces pixels (n, 2), or most of them.
 
     A perspective or already turned camera is returned unchanged. ``lens_from_camera`` of the
@@ -299,7 +299,7 @@ def faced(camera: Camera, points_2d: FloatArray) -> Camera:
     axis = _facing_axis(rays[valid]) if valid.any() else np.array([0.0, 0.0, 1.0])
     across = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0], axis)
     across /= np.linalg.norm(across)
-    return camera.turned([across, np.cross(axis, across), axis])
+    return camera.rotate([across, np.cross(axis, across), axis])
 
 
 def _facing_axis(rays: FloatArray) -> FloatArray:
@@ -327,7 +327,7 @@ def _cone_axis(rays: FloatArray) -> FloatArray:
 
 
 def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
-    """Normalised coordinates (n, 2) of pixels (n, 2) in the frame of a camera that was `faced`.
+    """Normalised coordinates (n, 2) of pixels (n, 2) in the frame of a camera of `face_pixels`.
 
     ``clips`` moves rays more than 85 degrees off the z axis to 85 degrees; otherwise they raise
     InputError. So do pixels at which the lens model cannot be inverted.
@@ -345,13 +345,13 @@ def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) ->
     return perspective(rays)
 
 
-def turned_alignment(alignment: Alignment, rotation: FloatArray) -> Alignment:
+def rotate_alignment(alignment: Alignment, rotation: FloatArray) -> Alignment:
     """Transform an alignment by the ``rotation`` (3, 3) from its camera frame to a new one."""
     turned = rotation @ alignment.rotation, rotation @ alignment.translation
     return Alignment(*turned, alignment.scale, is_valid=True)
 
 
-def turned_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
+def rotate_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
     """Transform packed poses (..., 15) by the ``rotation`` (3, 3) to a new camera frame."""
     turned = packed.copy()
     columns = packed[..., :9].reshape(*packed.shape[:-1], 3, 3)
@@ -360,7 +360,7 @@ def turned_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
     return turned
 
 
-def turned_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
+def rotate_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
     """Transform a pose's covariance (..., m, m), m >= 6, by the ``rotation`` (3, 3)."""
     turn = np.eye(covariance.shape[-1])
     turn[:3, :3] = turn[3:6, 3:6] = rotation

@@ -168,7 +168,7 @@ class Mesh:
         """Corners of all triangles, (m, 3, 3) float."""
         return np.asarray(self.vertices[self.faces])
 
-    def stretched(self, scale: npt.ArrayLike) -> Mesh:
+    def stretch(self, scale: npt.ArrayLike) -> Mesh:
         """Multiply the coordinates by ``scale`` (3,); returns a new mesh."""
         return replace(self, vertices=self.vertices * np.asarray(scale, dtype=float))
 

@@ -53,7 +53,7 @@ def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArra
     return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
 
 
-def unmeasured(points_2d: FloatArray, *, least: int = _LEAST_PLACEHOLDERS) -> BoolArray:
+def missing_pixels(points_2d: FloatArray, *, least: int = _LEAST_PLACEHOLDERS) -> BoolArray:
     """Mask (n,) of pixels (n, 2) that detectors write for keypoints that they did not find.
 
     These are values that are not finite; exactly (0, 0) or (-1, -1) if it occurs at least ``least``
@@ -74,7 +74,7 @@ def unmeasured(points_2d: FloatArray, *, least: int = _LEAST_PLACEHOLDERS) -> Bo
 def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) -> None:
     """Check that points (n, 2) are pixels of an image of the given size.
 
-    Raises InputError if several are detectors' placeholders (see `unmeasured`), or if all are
+    Raises InputError if several are detectors' placeholders (see `missing_pixels`), or if all are
     normalised coordinates: distinct and within about a pixel of the image's corner.
 
     Examples

@@ -39,7 +39,7 @@ class EmbreeEngine:
         found: FaceArray = self._scene.run(origins, directions)
         return found
 
-    def blocked(
+    def occlusion_mask(
         self, origins: SingleArray, directions: SingleArray, reach: float
     ) -> npt.NDArray[np.bool_]:
         """Mask (n,) of rays that hit anything before ``origin + reach * direction``."""
@@ -68,7 +68,7 @@ class Open3DEngine:
         found = self._scene.cast_rays(self._rays(origins, directions))["primitive_ids"].numpy()
         return np.asarray(np.where(found == self._no_hit, -1, found.astype(np.int32)), np.int32)
 
-    def blocked(
+    def occlusion_mask(
         self, origins: SingleArray, directions: SingleArray, reach: float
     ) -> npt.NDArray[np.bool_]:
         """See `EmbreeEngine`."""
@@ -116,11 +116,11 @@ class RayCaster:
         """Unit normals (n, 3) of triangles (n,)."""
         return self._normals[face]
 
-    def covered(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
+    def hit_mask(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
         """Mask (n,) of rays (n, 3) from one point that hit anything."""
-        return self._engine.blocked(*self._rays(origin, directions), np.inf)
+        return self._engine.occlusion_mask(*self._rays(origin, directions), np.inf)
 
-    def blocked(
+    def occlusion_mask(
         self, origins: FloatArray, directions: FloatArray, *, reach: float
     ) -> npt.NDArray[np.bool_]:
         """Mask (n,) of rays (n, 3) that hit anything within ``reach`` times their direction.
@@ -128,7 +128,7 @@ class RayCaster:
         Computed in single precision.
         """
         unit = (origins - self._center) / self._radius
-        return self._engine.blocked(
+        return self._engine.occlusion_mask(
             unit.astype(np.float32), (directions / self._radius).astype(np.float32), reach
         )
 

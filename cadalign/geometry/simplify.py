@@ -62,7 +62,7 @@ def number_rows(rows: npt.NDArray[np.float64] | npt.NDArray[np.int64]) -> IntArr
 
 
 @dataclass(frozen=True, eq=False)
-class Simplified:
+class SimplifiedMesh:
     """A simplified mesh.
 
     ``source`` (m,) is the number of a triangle of the full mesh that each triangle replaces.
@@ -75,7 +75,7 @@ class Simplified:
     wires: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
 
 
-def cluster(mesh: Mesh, *, cells: float) -> Simplified:
+def cluster(mesh: Mesh, *, cells: float) -> SimplifiedMesh:
     """Simplify a mesh: merge the vertices in each cell of a grid into their mean.
 
     See Rossignac, Borrel, "Multi-resolution 3D approximations for rendering complex scenes" (1993).
@@ -105,17 +105,17 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
     remaining = np.concatenate([faces[kept].ravel(), wires.ravel()])
     remaining, place = np.unique(remaining, return_inverse=True)
     corners, ends = np.split(place, [3 * len(kept)])
-    return Simplified(centers[remaining], corners.reshape(-1, 3), kept, ends.reshape(-1, 2))
+    return SimplifiedMesh(centers[remaining], corners.reshape(-1, 3), kept, ends.reshape(-1, 2))
 
 
-def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
+def simplify(mesh: Mesh, *, max_faces: int) -> SimplifiedMesh:
     """Simplify a mesh to at most ``max_faces`` triangles by `cluster`.
 
     The grid's resolution is adapted until the number of triangles is near the maximum. If no grid
     satisfies the maximum, the first ``max_faces`` triangles of the mesh are returned.
     """
     if len(mesh.faces) <= max_faces:
-        return Simplified(mesh.vertices, mesh.faces, np.arange(len(mesh.faces)))
+        return SimplifiedMesh(mesh.vertices, mesh.faces, np.arange(len(mesh.faces)))
     best, most = None, 0
     cells = np.sqrt(max_faces / _FACES_PER_CELL)
     for _ in range(_MOST_TRIES):
@@ -129,4 +129,4 @@ def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
         cells *= np.sqrt(0.8 * max_faces / max(count, 1))
     if best is not None:
         return best
-    return Simplified(mesh.vertices, mesh.faces[:max_faces], np.arange(max_faces))
+    return SimplifiedMesh(mesh.vertices, mesh.faces[:max_faces], np.arange(max_faces))

@@ -55,7 +55,7 @@ class Equal:
     center: FloatArray
     """Fixed point (3,) of all symmetries, in the model's frame."""
 
-    def relabelled(self, points: FloatArray) -> FloatArray:
+    def map_points(self, points: FloatArray) -> FloatArray:
         """Model points (n, 3) of the other alignment in this alignment's model frame; (n, 3)."""
         return np.asarray((points - self.motion[:3, 3]) @ self.motion[:3, :3])
 
@@ -215,7 +215,7 @@ class Symmetry:
             result = Alignment(turned, alignment.translation + shift, scale)
         return Equal(result, motion, free, self.center)
 
-    def nearest_turned(self, alignment: Alignment, rotation: FloatArray) -> Alignment:
+    def nearest_pose(self, alignment: Alignment, rotation: FloatArray) -> Alignment:
         """Apply the group to the stretched object; return the alignment nearest to ``rotation``.
 
         Unlike `canonical`, this assumes that the stretched object has the symmetry, not the model:

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from cadalign.errors import CadalignError, DataError, InputError, brief, quote, unknown
+from cadalign.errors import CadalignError, DataError, InputError, brief, quote, unknown_name
 from cadalign.io.files import read_text
 from cadalign.io.kinds import kind_of, refuse_other, refuse_other_file
 
@@ -93,7 +93,7 @@ def parse_json(text: str | bytes, where: str) -> Any:
             if msgspec.json.encode(line).count(_FIELD_END) == text.count(_FIELD_END):
                 return line  # no field occurs twice
     try:
-        with in_file(where):
+        with name_file(where):
             text = str(text, "utf-8") if isinstance(text, bytes) else text
             data = json.loads(text, object_pairs_hook=_unique_fields)
         if _SURROGATE.search(text):  # may be one of a pair
@@ -149,7 +149,7 @@ def convert(
 
 
 @contextmanager
-def in_file(path: Path | str) -> Iterator[None]:
+def name_file(path: Path | str) -> Iterator[None]:
     """Add the file, or file and line, to the place of errors about its content."""
     try:
         yield
@@ -161,7 +161,7 @@ def in_file(path: Path | str) -> Iterator[None]:
 
 
 @contextmanager
-def within(place: str) -> Iterator[None]:
+def name_part(place: str) -> Iterator[None]:
     """Add a part of a file, such as ``frames[3]``, to the place of errors about its content."""
     try:
         yield
@@ -228,7 +228,7 @@ def _convert_error(error: msgspec.ValidationError, data: Any, kind: Any, where: 
             more = "" if is_missing else f", and there is an unknown field {quote(name)}"
             fix = None if is_missing else f"known are {', '.join(known)}"
             return DataError(f"missing{more}", where=place, fix=fix)
-        refused = unknown("field", name, known)
+        refused = unknown_name("field", name, known)
         return DataError(refused.what, where=where or "top level", fix=refused.fix)
     if text.startswith("Invalid enum value"):
         allowed = ", ".join(map(repr, _parts_at(kind, path, "values")))

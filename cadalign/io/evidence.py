@@ -19,7 +19,7 @@ from msgspec import Struct
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, as_positive
 from cadalign.errors import DataError, InputError, require_kind
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of, unmeasured
+from cadalign.geometry.pixels import PixelOrigin, check_pixels, missing_pixels, shift_of
 from cadalign.io.documents import (
     Document,
     Finite,
@@ -152,7 +152,7 @@ class ObservedImage:
         Further evidence.
     not_found : tuple of int
         Rows of the file's keypoints that are left out because their pixels are not measurements;
-        see `cadalign.geometry.pixels.unmeasured`.
+        see `cadalign.geometry.pixels.missing_pixels`.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     camera = _camera(read.camera)
     pixels = [each.uv or (None, None) for each in read.keypoints]
     points_2d = np.array(pixels, dtype=float).reshape(-1, 2)  # NaN for None
-    is_found = ~unmeasured(points_2d)
+    is_found = ~missing_pixels(points_2d)
     points_2d = points_2d[is_found]
     check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
     keypoints = {row: each for row, each in enumerate(read.keypoints) if is_found[row]}

@@ -33,9 +33,9 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file atomically: if the process is killed, the file is complete or unchanged.
 
     ``write`` receives the path of a temporary file in the same folder, and writes it. Raises
-    DataError if the file cannot be written, or is an input (see `keeping`).
+    DataError if the file cannot be written, or is an input (see `protect_inputs`).
     """
-    with writing(path):
+    with guard_writing(path):
         refuse_folder(path)
         refuse_input(path)
         # A short name with the same ending, by which some writers choose the format.
@@ -50,7 +50,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 
 @contextmanager
-def writing_folder(path: Path) -> Iterator[Path]:
+def write_folder(path: Path) -> Iterator[Path]:
     """Write a folder atomically: if the process is killed, the folder is complete or unchanged.
 
     The block writes to a temporary folder, which replaces ``path`` at the end. An existing folder
@@ -58,7 +58,7 @@ def writing_folder(path: Path) -> Iterator[Path]:
     """
     import tempfile
 
-    with writing(path):
+    with guard_writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         # A unique name: two processes must not share the folder.
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
@@ -69,7 +69,7 @@ def writing_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def keeping(inputs: Iterable[Path | None]) -> Iterator[None]:
+def protect_inputs(inputs: Iterable[Path | None]) -> Iterator[None]:
     """Protect input files: within the block, overwriting them raises DataError.
 
     All functions that write files check it, also for files beside the named output.
@@ -84,27 +84,27 @@ def keeping(inputs: Iterable[Path | None]) -> Iterator[None]:
         _kept.reset(token)
 
 
-def keep(path: Path) -> None:
-    """Protect a further input file until the end of the innermost `keeping` block."""
+def protect_input(path: Path) -> None:
+    """Protect a further input file until the end of the innermost `protect_inputs` block."""
     kept = _kept.get()
     if kept is not None:
         kept.add(os.path.realpath(path))
 
 
 def refuse_input(path: Path) -> None:
-    """Raise a DataError if a file is protected; see `keeping`."""
+    """Raise a DataError if a file is protected; see `protect_inputs`."""
     if os.path.realpath(path) in (_kept.get() or ()):
         what = "this file is an input and would be overwritten"
         raise DataError(what, where=printable(path), fix="give another name")
 
 
 @contextmanager
-def locked(path: Path, what: str, *, fix: str) -> Iterator[None]:
+def hold_lock(path: Path, what: str, *, fix: str) -> Iterator[None]:
     """Hold a folder's lock file; the system releases it if the process is killed.
 
     Raises a DataError of text ``what`` that names the folder if another process holds it.
     """
-    with writing(path.parent):
+    with guard_writing(path.parent):
         lock = path.open("a")
     with lock:
         try:
@@ -140,7 +140,7 @@ def finite(value: Any) -> Any:
     return json.loads(json.dumps(value), parse_constant=lambda _: None)
 
 
-def damaged(what: str, where: object = None) -> DataError:
+def damage_error(what: str, where: object = None) -> DataError:
     """Return the error for a file whose content is incomplete or damaged."""
     fix = "the file is cut short or damaged; get it again"
     return DataError(what, where=None if where is None else str(where), fix=fix)
@@ -149,7 +149,9 @@ def damaged(what: str, where: object = None) -> DataError:
 def require_count(what: str, announced: int, found: int, surplus: int, path: Path) -> None:
     """Raise a DataError if a file has less than its header announces; warn of surplus bytes."""
     if found < announced:
-        raise damaged(f"the header announces {announced} {what}, but only {found} are there", path)
+        raise damage_error(
+            f"the header announces {announced} {what}, but only {found} are there", path
+        )
     if surplus:
         logger.warning("%s: %d bytes after its data are ignored", path, surplus)
 
@@ -163,7 +165,7 @@ def as_path(given: object, where: str = "path") -> Path:
     return Path(text)
 
 
-def listed(folder: Path, pattern: str | None = None) -> list[Path]:
+def list_folder(folder: Path, pattern: str | None = None) -> list[Path]:
     """List a folder's entries, or those that match a pattern, sorted, without hidden ones.
 
     Archives made on a Mac have a hidden file ``._a.mat`` beside ``a.mat``, of another format.
@@ -173,7 +175,7 @@ def listed(folder: Path, pattern: str | None = None) -> list[Path]:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def guard_reading(path: Path) -> Iterator[None]:
     """Convert errors of the file system and of UTF-8 decoding to `DataError`."""
     refuse_nul(path)
     try:
@@ -198,7 +200,7 @@ def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
     Raises DataError if the file is missing, not regular, larger, or cannot be read.
     """
     path = as_path(path)
-    with reading(path), open(path, "rb", opener=_open_nonblocking) as file:
+    with guard_reading(path), open(path, "rb", opener=_open_nonblocking) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             fix = "give a regular file, not a pipe or device"
@@ -243,13 +245,13 @@ def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
 def read_text(path: Path, *, most: int = MOST_BYTES, errors: str = "strict") -> str:
     """Read a regular text file, UTF-8 with or without byte order mark; see `open_input`."""
     data = read_bytes(path, most=most)
-    with reading(path):
+    with guard_reading(path):
         text = data.decode("utf-8-sig", errors=errors)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def guard_writing(path: Path) -> Iterator[None]:
     """Convert errors of the file system to `DataError`."""
     refuse_nul(path)
     try:
@@ -264,9 +266,9 @@ def writing(path: Path) -> Iterator[None]:
         ) from None
 
 
-def made_folder(path: Path) -> Path:
+def create_folder(path: Path) -> Path:
     """Create a folder and its parents; returns it."""
-    with writing(path):
+    with guard_writing(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
 
@@ -331,7 +333,7 @@ class Seal:
             raise self.error(what, where)
         require_count("bytes", size, len(payload), len(payload) - size, Path(where))
         if checksum(payload[:size]) != expected:
-            raise damaged("the checksum is wrong", where)
+            raise damage_error("the checksum is wrong", where)
         return payload[:size]
 
     def error(self, what: str, where: str) -> DataError:

@@ -17,7 +17,7 @@ logger = logging.getLogger("cadalign")
 SHORTEST, LONGEST = 0.1, 50.0
 """Range of plausible focal lengths [longer side of the image]: fields of view of 157 to 1 deg."""
 USUAL: Final = "usual"
-"""Option for the prior of usual lenses, `FocalPrior.of_usual_lenses`."""
+"""Option for the prior of usual lenses, `FocalPrior.from_size`."""
 _USUAL_FOCAL = 1.2  # over the longer side of the image
 _USUAL_SIGMA = 0.6
 _EXIF_SIGMA = 0.05  # rounding, focusing, and lens corrections inside the camera
@@ -69,7 +69,7 @@ class FocalPrior:
         )
 
     @classmethod
-    def of_usual_lenses(cls, width: int, height: int) -> FocalPrior:
+    def from_size(cls, width: int, height: int) -> FocalPrior:
         """Build the prior for a photo of which only the size is known.
 
         Its mean is 1.2 times the longer side, the default of COLMAP and openMVG for photos without
@@ -85,7 +85,7 @@ class FocalPrior:
 
         Examples
         --------
-        >>> print(FocalPrior.of_usual_lenses(640, 480))
+        >>> print(FocalPrior.from_size(640, 480))
         768 px +- 60 %, usual lenses
         """
         return cls(_USUAL_FOCAL * max(width, height), _USUAL_SIGMA, "usual lenses")
@@ -137,7 +137,7 @@ PriorOption = FocalPrior | Literal["usual"] | None
 def prior_of_camera(prior: PriorOption, camera: Camera) -> FocalPrior | None:
     """Return the prior on a camera's focal length."""
     if prior == USUAL:
-        return FocalPrior.of_usual_lenses(camera.width, camera.height)
+        return FocalPrior.from_size(camera.width, camera.height)
     assert not isinstance(prior, str)
     return prior
 

@@ -26,9 +26,9 @@ from cadalign.io.documents import (
     Positive,
     Text,
     convert,
-    in_file,
+    name_file,
+    name_part,
     read_json,
-    within,
     written_path,
 )
 from cadalign.io.evidence import (
@@ -140,8 +140,8 @@ class Observation(ObservedImage):
         Name of the object.
     up_axis : {"y", "x", "z"} or None
         The model's axis that points up, as for `cadalign.Model`.
-    unfinished : mapping, optional
-        Annotator state that is not usable as evidence yet.
+    draft : mapping, optional
+        Annotator state that is not usable as evidence yet; the field ``unfinished`` of the file.
     """
 
     model: Path | None = None
@@ -153,7 +153,7 @@ class Observation(ObservedImage):
     init: Alignment | None = field(default=None, kw_only=True)
     object_name: str | None = field(default=None, kw_only=True)
     up_axis: Literal["x", "y", "z"] | None = field(default="y", kw_only=True)
-    unfinished: Mapping[str, Any] | None = field(default=None, kw_only=True)
+    draft: Mapping[str, Any] | None = field(default=None, kw_only=True)
 
     @property
     def views(self) -> tuple[ObservedImage, ...]:
@@ -196,7 +196,7 @@ class Observation(ObservedImage):
         """
         path = as_path(path)
         data = read_json(path, OBSERVATION)
-        with in_file(path):
+        with name_file(path):
             return cls.from_dict(data, folder=path.parent, needs_xyz=needs_xyz)
 
     @classmethod
@@ -212,13 +212,13 @@ class Observation(ObservedImage):
         needs_xyz = read.shape is None if needs_xyz is None else needs_xyz
         images = []
         for number, each in enumerate(fields):
-            with nullcontext() if each is read else within(f"views[{number}]"):
+            with nullcontext() if each is read else name_part(f"views[{number}]"):
                 images.append(read_image_fields(each, needs_xyz=needs_xyz))
         first, *others = images
         options = msgspec.to_builtins(read.fit)
         if first.not_found and isinstance(options.get("sigma"), list):
             options["sigma"] = np.delete(options["sigma"], first.not_found).tolist()
-        with within("init"):
+        with name_part("init"):
             init = None if read.init is None else Alignment.from_dict(read.init)
         return cls(
             **vars(first),
@@ -231,7 +231,7 @@ class Observation(ObservedImage):
             init=init,
             object_name=read.object,
             up_axis=read.up_axis,
-            unfinished=read.unfinished,
+            draft=read.unfinished,
         )
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
@@ -248,7 +248,7 @@ class Observation(ObservedImage):
             "size": self.size and msgspec.to_builtins(self.size),
             "symmetry": self.symmetry and self.symmetry.to_dict(),
             "init": self.init and self.init.to_dict(),
-            "unfinished": self.unfinished,
+            "unfinished": self.draft,
             "fit": self.fit_options,
         }
         data |= {name: value for name, value in further.items() if value}
@@ -271,7 +271,7 @@ class ObservationChanges:
         """Read the camera, or None; ``size`` is the photo's, for a file with only a matrix."""
         return None if self.camera is None else read_camera(self.camera, size=size)
 
-    def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
+    def apply(self, observation: Observation, where: str | None = None) -> Observation:
         """Replace an observation's camera and focal length; ``where`` is the observation's file.
 
         Raises InputError if a camera is given and the observation has several views.
@@ -287,8 +287,8 @@ class ObservationChanges:
             return changed
         # The new focal length replaces the file's options about it.
         kept = {key: given for key, given in changed.fit_options.items() if "focal" not in key}
-        others = [replace(view, camera=view.camera.with_focal(focal)) for view in changed.others]
-        camera = changed.camera.with_focal(focal)
+        others = [replace(view, camera=view.camera.replace_focal(focal)) for view in changed.others]
+        camera = changed.camera.replace_focal(focal)
         return replace(changed, camera=camera, others=tuple(others), fit_options=kept)
 
 
@@ -334,11 +334,13 @@ def read_camera(path: str | os.PathLike[str], *, size: tuple[int, int] | None = 
             numbers = np.array(read_text(path).replace(",", " ").split(), dtype=float)
             form = {"matrix": numbers.reshape(3, 3)}
         except ValueError:
-            raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
+            is_list = path.name == "cameras.txt"
+            what = "COLMAP's list of cameras, not one" if is_list else "not a calibration matrix"
+            raise DataError(what, where=str(path), fix=CAMERA_FIX) from None
     if isinstance(form, dict) and "matrix" in form and not {"width", "height"} <= set(form):
         if size is None:
             what = "the file has only a matrix, and the size of the image is unknown"
             raise DataError(what, where=str(path), fix="give the photo, or add width and height")
         form |= {"width": size[0], "height": size[1]}
-    with in_file(path):
+    with name_file(path):
         return Camera.from_dict(form)

@@ -36,7 +36,7 @@ class HeadlineRow:
     best: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, run: int, line: Summary, columns: Sequence[Metric]) -> HeadlineRow:
+    def from_summary(cls, run: int, line: Summary, columns: Sequence[Metric]) -> HeadlineRow:
         """Convert a summary to a row, in the columns' units."""
         cells = {column.key: column.shown(line.number(column.key)) for column in columns}
         return cls(run, line.group, line.method, cells)
@@ -85,7 +85,9 @@ def headline_of(runs: Sequence[Run]) -> Headline:
     shown = tuple(columns.values())
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
-        rows += _mark_best([HeadlineRow.of(index, line, shown) for line in lines[index]], shown)
+        rows += _mark_best(
+            [HeadlineRow.from_summary(index, line, shown) for line in lines[index]], shown
+        )
         group = spec_of(run).group(run)
         failures += _reasons(index, run, group, FAILED)
         skipped += _reasons(index, run, group, SKIPPED)

@@ -23,7 +23,7 @@ from cadalign.evaluation.plots import compact
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import LEFT_OUT, OK, SKIPPED
-from cadalign.io.files import listed, read_bytes
+from cadalign.io.files import list_folder, read_bytes
 
 InstanceName = tuple[str, str, int]
 """Category, model id, view."""
@@ -130,7 +130,7 @@ class Media:
             folder = run.folder
             folders = folder.pictures, folder.thumbs, folder.previews
             # List each folder once: checking thousands of files takes seconds.
-            there = {path for each in folders if each.is_dir() for path in listed(each)}
+            there = {path for each in folders if each.is_dir() for path in list_folder(each)}
             for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))

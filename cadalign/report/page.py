@@ -51,9 +51,9 @@ from cadalign.evaluation.plots import Plot, color_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import (
     as_path,
+    create_folder,
     dense_json,
-    keeping,
-    made_folder,
+    protect_inputs,
     refuse_folder,
     refuse_input,
     write_text,
@@ -104,9 +104,9 @@ def write_report(
     page = as_path(path)
     refuse_folder(page)
     found = read_runs(runs)
-    with keeping(path for run in found for path in run.folder.sources):
+    with protect_inputs(path for run in found for path in run.folder.sources):
         refuse_input(page)
-    made_folder(page.parent)
+    create_folder(page.parent)
     table, media, summary = None, Media(), summary_of(found)
     metrics = shown_metrics(found)
     if metrics:

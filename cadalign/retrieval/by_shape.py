@@ -36,7 +36,7 @@ from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import faced, turned_alignment
+from cadalign.geometry.camera import face_pixels, rotate_alignment
 from cadalign.retrieval.kernels import MOST_STRETCH
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import MISSING_PROB, SPURIOUS, RetrievalOptions
@@ -162,7 +162,7 @@ def _rank_models(
     logs += has[:, seen].sum(axis=1) * np.log1p(-MISSING_PROB)
     axes, centres = options.fitting.stretched_axes, known.centres[models]
     scales = _scales(squares, products, axes)
-    pose = turned_alignment(result.alignment, turn)
+    pose = rotate_alignment(result.alignment, turn)
     poses = _poses(pose, scales, aim - scales * centres, axes)
     across = poses[:, 6:9] * poses[:, 12:]  # the last row of the linear part
     depths = np.einsum("nka,na->nk", centred[:, :-BOX_ROWS], across).min(axis=1)
@@ -226,7 +226,7 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     stacked[:, -BOX_ROWS:] = table.bounds[table.rows_of(category)]
     has = ~np.isnan(stacked[:, :-BOX_ROWS, 0])
     extent = float(np.linalg.norm(np.ptp(shape.mean, axis=0)))
-    prior = gaussians_of(shape).widened(_FLOOR * extent)
+    prior = gaussians_of(shape).widen(_FLOOR * extent)
     flat = _complete(stacked.reshape(len(stacked), -1), prior)
     weights, full = _weights(stacked.shape[1]), flat.reshape(stacked.shape)
     centres = weights @ full
@@ -243,7 +243,7 @@ def _complete(values: FloatArray, prior: Gaussians) -> FloatArray:
     logs = np.array([log_likelihoods(vectors, part) for part in parts])
     shares = np.exp(logs - np.logaddexp.reduce(logs, axis=0))
     pairs = zip(shares, parts, strict=True)
-    return np.asarray(sum(share[:, None] * vectors.completed(part) for share, part in pairs))
+    return np.asarray(sum(share[:, None] * vectors.complete(part) for share, part in pairs))
 
 
 def _deviation(values: FloatArray, prior: Gaussians) -> float:
@@ -279,13 +279,13 @@ def shape_posterior(
     closed form; its weight is multiplied by its probability of b.
     """
     assert isinstance(result.model, ShapeModel)
-    camera, rows_of = faced(view.camera, view.pixels), prior_of(result.model).rows_of
+    camera, rows_of = face_pixels(view.camera, view.pixels), prior_of(result.model).rows_of
     options = FitOptions(loss=loss, loss_scale=loss_scale)
     names = rows_of(view.keypoint_ids, "view.ids")
     seen = seen_keypoints(replace(view, camera=camera), view.pixels, names, options)
     kept = result.inliers
     seen = Seen(seen.points[kept], seen.rays[kept], seen.whitening[kept], *seen[3:])
-    pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
+    pose = rotate_alignment(result.alignment, camera.lens_from_camera.T)
     estimate, columns = np.concatenate([result.points_3d, result.bounds]), coordinates_of(seen)
     errors, rows, by_pose = linearise(estimate[seen.points], pose, seen)
     full, triangle = np.linalg.qr(by_pose, mode="complete")

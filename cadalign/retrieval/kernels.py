@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 from cadalign.solvers.alignment import Objective, evaluate_cost
 from cadalign.solvers.constants import OK, POSE_SIZE, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
@@ -276,7 +276,7 @@ def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: F
     return best
 
 
-@inlined
+@inline
 def _whiten(factor: FloatArray, row: FloatArray) -> float:
     """Divide the first 4 entries by a lower triangle, in place; returns their squared length."""
     square = 0.0

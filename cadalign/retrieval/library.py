@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import IntArray
-from cadalign.datasets.image_keypoints import plain_name, some_of
+from cadalign.datasets.image_keypoints import first_names, plain_name
 from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import as_path, listed
+from cadalign.io.files import as_path, list_folder
 from cadalign.io.kinds import MESH_ENDINGS
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import category_to_rank, rank_by_shape
@@ -121,11 +121,11 @@ class Library(ModelTable):
         unknown = [name for name in names if plain_name(name) not in known]
         if unknown:
             what = f"no model of the library has a keypoint {unknown[0]!r}"
-            raise InputError(what, where="ids", fix=f"it has {some_of(self.keypoints.names)}")
+            raise InputError(what, where="ids", fix=f"it has {first_names(self.keypoints.names)}")
         return np.array([known[plain_name(name)] for name in names], dtype=np.int64)
 
     @property
-    def with_mesh(self) -> int:
+    def mesh_count(self) -> int:
         """Number of models that have a mesh."""
         return len(self) - self.meshes.count(None)
 
@@ -209,7 +209,7 @@ class Library(ModelTable):
 
 def keypoint_files(folder: Path) -> list[Path]:
     """Keypoints files in a folder and its subfolders."""
-    return listed(folder, f"**/*{SUFFIX}")
+    return list_folder(folder, f"**/*{SUFFIX}")
 
 
 def _read_own_models(folder: Path) -> tuple[list[LibraryModel], dict[str, int]]:
@@ -220,7 +220,7 @@ def _read_own_models(folder: Path) -> tuple[list[LibraryModel], dict[str, int]]:
     read = [(path, ModelKeypoints.load(path)) for path in files]
     names = _semantic_ids(read)
     models = [_model(path, found, names) for path, found in read]
-    meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
+    meshes = [path for path in list_folder(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
     used = {model.mesh_path for model in models}
     unused = [path for path in meshes if path.absolute() not in used]
     if unused:

@@ -12,7 +12,12 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.assemble import KeypointPosterior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FittedKeypoints, Posterior, point_slopes, quickly
+from cadalign.estimation.result_parts import (
+    FittedKeypoints,
+    Posterior,
+    create_unchecked,
+    point_slopes,
+)
 from cadalign.estimation.uncertainty.residuals import loss_weights
 from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text
 from cadalign.geometry.camera import Camera
@@ -165,7 +170,7 @@ def posterior_of_keypoints(
     given = points_3d, residuals, inliers, alignment, camera, options
     keypoints = FittedKeypoints(*given, fisher_covariance=covariance)
     known = {"keypoints": keypoints, "diagnosis": None, "fisher_covariance": covariance}
-    return quickly(KeypointPosterior, known)
+    return create_unchecked(KeypointPosterior, known)
 
 
 def posterior_by_shape(shape: Result, alignment: Alignment, options: FitOptions) -> Posterior:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.datasets.image_keypoints import plain_name, some_of
-from cadalign.errors import DataError, InputError, refuse_unused, unknown
-from cadalign.io.documents import convert, in_file, read_json
+from cadalign.datasets.image_keypoints import first_names, plain_name
+from cadalign.errors import DataError, InputError, refuse_unused, unknown_name
+from cadalign.io.documents import convert, name_file, read_json
 from cadalign.io.files import once_per_file
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.retrieval.options import RetrievalOptions
@@ -45,7 +45,7 @@ class ObservationRetrieval:
     """Standard deviation of the keypoints [px]; by default the observation's, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
 
-    def opened(self) -> tuple[Library, ShapeModel | None]:
+    def open_files(self) -> tuple[Library, ShapeModel | None]:
         """Read the library and the shape model, cached; raises DataError if unreadable."""
         if self.shape is None:
             refuse_unused(self, ("keypoint_names",), "without a shape")
@@ -60,11 +60,11 @@ class ObservationRetrieval:
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
     ) -> Observation:
         """Convert a parsed observation and apply changes; its keypoints need no xyz."""
-        with in_file(where):
+        with name_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
-        return changes.applied_to(seen, where)
+        return changes.apply(seen, where)
 
-    def with_ids(self, seen: Observation, where: str) -> Observation:
+    def resolve_ids(self, seen: Observation, where: str) -> Observation:
         """Add the library's semantic ids by keypoint names, unless the observation has ids.
 
         With a shape, names and ids are the shape's.
@@ -72,12 +72,12 @@ class ObservationRetrieval:
         Raises DataError if there are no keypoints, or if they have neither ids nor names;
         InputError if the library lacks a name.
         """
-        library, shape = self.opened()
+        library, shape = self.open_files()
         if shape is not None and seen.names and {*seen.names} <= {*shape.names}:
             return replace(seen, ids=np.array(shape.ids)[shape.rows(seen.names)])
         if seen.ids is not None and len(seen.points_2d):
             return seen
-        with in_file(where):
+        with name_file(where):
             if not len(seen.points_2d):
                 raise DataError("there are no keypoints")
             if seen.names is None:
@@ -90,7 +90,7 @@ class ObservationRetrieval:
         if seen.others:
             message = "%s: models are ranked by the first of its %d photos alone"
             logger.warning(message, where, len(seen.views))
-        library, shape = self.opened()
+        library, shape = self.open_files()
         assert seen.ids is not None
         own_sigma = 1.0 if seen.sigma is None else seen.sigma
         sigma = own_sigma if self.sigma is None else self.sigma
@@ -121,7 +121,7 @@ def relabel(
     unknown name, or fewer than 3 keypoints agree.
     """
     if unused := [name for name in table if name not in names]:
-        raise unknown("keypoint of the library", unused[0], names, where="keypoint_names")
+        raise unknown_name("keypoint of the library", unused[0], names, where="keypoint_names")
     if not names or not (table or shape.names):
         return shape
     row_of = {f"keypoint {label}": row for row, label in enumerate(shape.ids)}
@@ -133,7 +133,7 @@ def relabel(
         elif (row := row_of.get(plain_name(name))) is not None:
             own.setdefault(row, number)
     if len(own) < _LEAST_KEYPOINTS:
-        what = f"{len(own)} of its keypoints ({some_of(list(names))}) are {shape.category}'s"
+        what = f"{len(own)} of its keypoints ({first_names(list(names))}) are {shape.category}'s"
         fix = "give keypoint_names, a JSON table of its names with the shape's names"
         raise InputError(what, where=where, fix=fix)
     free = count(1 + max(names.values()))  # for keypoints that the library lacks
@@ -142,5 +142,5 @@ def relabel(
 
 
 def _read_table(path: Path) -> dict[str, str | int]:
-    with in_file(path):
+    with name_file(path):
         return convert(read_json(path), dict[str, str | int])

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, worker_count
-from cadalign.datasets.image_keypoints import some_of
+from cadalign.datasets.image_keypoints import first_names
 from cadalign.datasets.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.options import LOSSES
@@ -30,7 +30,7 @@ from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import ViewResult
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, faced, turned_alignment
+from cadalign.geometry.camera import Camera, face_pixels, rotate_alignment
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
 from cadalign.retrieval.match import Match, posterior_by_shape, posterior_of_keypoints
 from cadalign.retrieval.models import ModelKey, ModelTable, check_key, check_semantic_ids
@@ -106,7 +106,7 @@ def observe(
     order = np.argsort(ids)
     pixels, ids = pixels[order], ids[order]
     covariances = _covariances(options, pixels, order)
-    facing = faced(camera, pixels)
+    facing = face_pixels(camera, pixels)
     rays = np.require(rays_of(pixels, facing), np.float64, ["C", "W"])
     fitting = options.fitting
     density = np.log1p(-MISSING_PROB) - np.log(2 * np.pi)
@@ -175,7 +175,9 @@ def gather_candidates(
     if len(unknown):
         where = "the library" if category is None else f"the category {category!r}"
         what = f"no model of {where} has a keypoint with the semantic id {unknown[0]}"
-        raise InputError(what, where="ids", fix=f"it has {some_of([str(each) for each in known])}")
+        raise InputError(
+            what, where="ids", fix=f"it has {first_names([str(each) for each in known])}"
+        )
     spans = np.stack([table.offsets[chosen], table.offsets[chosen + 1]], axis=1)
     candidates = Candidates(table.xyz, table.ids, spans)
 
@@ -307,8 +309,8 @@ def make_matches(
     for place, candidate in enumerate(ranking.candidates[: options.top].tolist()):
         points_3d, rows = shared_keypoints(candidates, observed, candidate)
         model = table.model(int(candidates.models[candidate]))
-        found = Alignment.from_packed(ranking.poses[place])
-        alignment = turned_alignment(found, observed.facing.lens_from_camera)
+        found = Alignment.from_vector(ranking.poses[place])
+        alignment = rotate_alignment(found, observed.facing.lens_from_camera)
         pixels, camera = observed.points_2d[rows], observed.camera
         residuals = camera.project(alignment.apply(points_3d)) - pixels
         if ranking.shape is not None:

@@ -115,10 +115,10 @@ def find_mirror(completed: FloatArray, axis: int) -> Mirror:
 def is_symmetry(completed: FloatArray, mirror: Mirror) -> bool:
     """True if the mirrored mean is as near to the mean as the models are; see `find_mirror`."""
     mean = completed.mean(axis=0, keepdims=True)
-    return bool(np.abs(mirrored(mean, mirror) - mean).mean() <= np.abs(completed - mean).mean())
+    return bool(np.abs(mirror_rows(mean, mirror) - mean).mean() <= np.abs(completed - mean).mean())
 
 
-def mirrored(rows: FloatArray, mirror: Mirror) -> FloatArray:
+def mirror_rows(rows: FloatArray, mirror: Mirror) -> FloatArray:
     """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN if missing."""
     exchanged = rows[:, [*mirror.partners, -BOX_ROWS, -1]]
     exchanged[..., mirror.axis] = -exchanged[..., mirror.axis]

@@ -50,13 +50,14 @@ class ShapeCalibration(NamedTuple):
 class _View(NamedTuple):
     """An image of g of a model's n keypoints.
 
-    ``entries`` (3 n,) index the shape vector. ``by_shape`` (2 g, 3 n) and ``by_pose`` (2 g, 6) are
-    derivatives of the image, ``image`` (2 g,) the observed and ``truth`` (n, 3) the true points.
+    ``entries`` (3 n,) index the shape vector. ``shape_derivatives`` (2 g, 3 n) and
+    ``pose_derivatives`` (2 g, 6) are those of the image, ``image`` (2 g,) the observed and
+    ``truth`` (n, 3) the true points.
     """
 
     entries: IntArray
-    by_shape: FloatArray
-    by_pose: FloatArray
+    shape_derivatives: FloatArray
+    pose_derivatives: FloatArray
     image: FloatArray
     truth: FloatArray
 
@@ -121,15 +122,15 @@ def _view(
     rotation = rotation_from_quat_wxyz(quat / np.linalg.norm(quat))
     points = row[known]
     turned = (points[given] - points[given].mean(axis=0)) @ rotation.T
-    by_pose = np.zeros((len(given), 2, _POSE))
-    by_pose[:, 0, 1], by_pose[:, 0, 2] = turned[:, 2], -turned[:, 1]
-    by_pose[:, 1, 0], by_pose[:, 1, 2] = -turned[:, 2], turned[:, 0]
-    by_pose[:, 0, 3] = by_pose[:, 1, 4] = 1.0
-    by_pose[:, :, 5] = turned[:, :2]
-    by_shape = np.asarray(np.kron(np.eye(len(known))[given], rotation[:2]), dtype=float)
+    pose_derivatives = np.zeros((len(given), 2, _POSE))
+    pose_derivatives[:, 0, 1], pose_derivatives[:, 0, 2] = turned[:, 2], -turned[:, 1]
+    pose_derivatives[:, 1, 0], pose_derivatives[:, 1, 2] = -turned[:, 2], turned[:, 0]
+    pose_derivatives[:, 0, 3] = pose_derivatives[:, 1, 4] = 1.0
+    pose_derivatives[:, :, 5] = turned[:, :2]
+    shape_derivatives = np.asarray(np.kron(np.eye(len(known))[given], rotation[:2]), dtype=float)
     entries = (3 * known[:, None] + np.arange(3)).ravel()
-    image = by_shape @ points.ravel() + sigma * rng.standard_normal(len(by_shape))
-    return _View(entries, by_shape, by_pose.reshape(-1, _POSE), image, points)
+    image = shape_derivatives @ points.ravel() + sigma * rng.standard_normal(len(shape_derivatives))
+    return _View(entries, shape_derivatives, pose_derivatives.reshape(-1, _POSE), image, points)
 
 
 class _Posterior(NamedTuple):
@@ -152,14 +153,14 @@ def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: flo
     In the eigenbasis of the shape's covariance in the image, covariances are diagonal.
     """
     n, squares = len(mean) // 3, _FACTORS**2
-    across = view.by_shape @ covariance
-    values, vectors = np.linalg.eigh(across @ view.by_shape.T)
+    across = view.shape_derivatives @ covariance
+    values, vectors = np.linalg.eigh(across @ view.shape_derivatives.T)
     precisions = 1 / (squares[:, None] * np.maximum(values, 0.0) + sigma**2)  # (F, 2 g)
-    known = np.column_stack([view.image - view.by_shape @ mean, view.by_pose])
+    known = np.column_stack([view.image - view.shape_derivatives @ mean, view.pose_derivatives])
     known, across = vectors.T @ known, vectors.T @ across
-    gap, by_pose = known[:, 0], known[:, 1:]
-    weighted = by_pose.T * precisions[:, None]  # (F, 6, 2 g)
-    of_pose = np.linalg.inv(weighted @ by_pose)
+    gap, pose_derivatives = known[:, 0], known[:, 1:]
+    weighted = pose_derivatives.T * precisions[:, None]  # (F, 6, 2 g)
+    of_pose = np.linalg.inv(weighted @ pose_derivatives)
     gain = weighted @ across  # (F, 6, 3 n)
     blocks = across.reshape(-1, n, 3)
     pairs = (blocks[..., :, None] * blocks[..., None, :]).reshape(len(across), -1)
@@ -170,7 +171,7 @@ def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: flo
     own = np.einsum("iaib->iab", covariance.reshape(n, 3, n, 3))
     first = precisions[0]  # estimates do not use the factor
     pose = of_pose[0] @ (weighted[0] @ gap)
-    gap = gap - by_pose @ pose
+    gap = gap - pose_derivatives @ pose
     rest = first * gap
     each = squares[:, None, None, None]
     return _Posterior(
@@ -214,7 +215,7 @@ def box_excesses(rows: FloatArray, mixture: Gaussians) -> FloatArray:
     without = rows.copy()
     without[:, -BOX_ROWS:] = np.nan
     vectors = Vectors(without.reshape(len(rows), -1), np.ones(len(rows)))
-    linear = vectors.completed(mixture).reshape(rows.shape)
+    linear = vectors.complete(mixture).reshape(rows.shape)
     return np.asarray(OUTWARD * (linear - rows)[:, -BOX_ROWS:])
 
 

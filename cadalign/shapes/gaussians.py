@@ -29,7 +29,7 @@ class Gaussians(NamedTuple):
     means: FloatArray
     covariances: FloatArray
 
-    def widened(self, sigma: float) -> Gaussians:
+    def widen(self, sigma: float) -> Gaussians:
         """Add independent noise to every entry; returns the new distribution."""
         noise = sigma**2 * np.eye(self.means.shape[1])
         return Gaussians(self.weights, self.means, self.covariances + noise)
@@ -89,7 +89,7 @@ class Vectors:
         """Mean squared distance of the entries from their means."""
         return float(np.nanmean((self.values - self.mean) ** 2))
 
-    def completed(self, model: Gaussians) -> FloatArray:
+    def complete(self, model: Gaussians) -> FloatArray:
         """Fill missing entries with their expectations under the likeliest component, (N, d)."""
         given, unweighted = _conditionals(self, model), np.zeros(len(self.values))
         likeliest = _log_densities(self, model, given).argmax(axis=1)

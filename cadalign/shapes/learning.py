@@ -22,7 +22,7 @@ from cadalign.shapes.basis import (
     component_of_covariance,
     find_mirror,
     is_symmetry,
-    mirrored,
+    mirror_rows,
 )
 from cadalign.shapes.calibration import ShapeCalibration, box_excesses, calibrate, learn_margins
 from cadalign.shapes.examples import Example, tabulate
@@ -80,10 +80,10 @@ class _Models:
         """The models, without mirror images."""
         return _vectors(self.rows, None)
 
-    def completed(self) -> FloatArray:
+    def complete(self) -> FloatArray:
         """Fill missing keypoints with their expectations, (N, m + 2, 3) float."""
         common = self.common(_Recipe(strength=0.0))[1]
-        return self.vectors.completed(common).reshape(self.rows.shape)
+        return self.vectors.complete(common).reshape(self.rows.shape)
 
     def common(self, recipe: _Recipe) -> tuple[Vectors, Gaussians]:
         """Vectors to learn from and the Gaussian of all, which all numbers of components share."""
@@ -117,7 +117,7 @@ class _Models:
         A broad component for 1 % of the models limits the influence of outliers on the choice
         between mixtures.
         """
-        common = log_likelihoods(self.vectors, mixture.widened(_RESOLUTION * self.size))
+        common = log_likelihoods(self.vectors, mixture.widen(_RESOLUTION * self.size))
         broad = Gaussians(
             np.ones(1),
             mixture.means.mean(axis=0)[None],
@@ -165,7 +165,7 @@ class _CrossValidation:
         return recipe, modes, figures | {"box_margins": self._margins(best)}
 
     def _try_mirrors(self, best: _Trial) -> _Trial:
-        completed = self._models.completed()
+        completed = self._models.complete()
         found = [find_mirror(completed, axis) for axis in range(3)]
         mirrors = [each for each in found if is_symmetry(completed, each)]
         if not mirrors:
@@ -249,7 +249,7 @@ def _vectors(rows: FloatArray, mirror: Mirror | None) -> Vectors:
     """Flatten models to vectors; with a mirror, add mirror images and halve the weights."""
     weight = 1.0
     if mirror is not None:
-        rows = np.concatenate([rows, mirrored(rows, mirror)])
+        rows = np.concatenate([rows, mirror_rows(rows, mirror)])
         weight = 0.5
     return Vectors(rows.reshape(len(rows), -1), np.full(len(rows), weight))
 
@@ -259,7 +259,7 @@ def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
     from scipy.cluster.vq import kmeans2
 
     _, directions = np.linalg.eigh(common.covariances[0])
-    coefficients = (vectors.completed(common) - common.means[0]) @ directions[:, -_CLUSTER_MODES:]
+    coefficients = (vectors.complete(common) - common.means[0]) @ directions[:, -_CLUSTER_MODES:]
     tries = []
     for seed in range(_CLUSTERINGS):
         with warnings.catch_warnings():

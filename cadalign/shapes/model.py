@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
-from cadalign.errors import InputError, quote, unknown
+from cadalign.errors import InputError, quote, unknown_name
 from cadalign.io.files import as_path, once_per_file
 from cadalign.shapes.basis import component_of_basis
 from cadalign.shapes.gaussians import Gaussians
@@ -298,7 +298,7 @@ class ShapeModel:
         ('seat, front right', [4])
         """
         if category not in CATEGORIES:
-            raise unknown("category", category, CATEGORIES, where="category")
+            raise unknown_name("category", category, CATEGORIES, where="category")
         return read_shape(shape_path(Path(category)), cls)
 
     @classmethod

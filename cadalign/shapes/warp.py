@@ -75,14 +75,14 @@ def warp_mesh(
 class LinearWarp(NamedTuple):
     """Warp of p points as a linear function of n keypoints' targets and the target box.
 
-    ``by_keypoints`` (p, n) are the weights of the targets along every axis, ``by_least`` and
-    ``by_greatest`` (p, 3) the weights of the box's corners along each axis. ``constant`` (p, 3) is
-    added.
+    ``keypoint_weights`` (p, n) are the weights of the targets along every axis, ``minimum_weights``
+    and ``maximum_weights`` (p, 3) those of the box's corners along each axis. ``constant`` (p, 3)
+    is added.
     """
 
-    by_keypoints: FloatArray
-    by_least: FloatArray
-    by_greatest: FloatArray
+    keypoint_weights: FloatArray
+    minimum_weights: FloatArray
+    maximum_weights: FloatArray
     constant: FloatArray
 
     def apply(self, target: FloatArray, bounds: FloatArray) -> FloatArray:
@@ -91,8 +91,8 @@ class LinearWarp(NamedTuple):
 
     def derivative(self, target: FloatArray, bounds: FloatArray) -> FloatArray:
         """Displacements (p, 3) for displacements of targets (n, 3) and box corners (2, 3)."""
-        of_box = self.by_least * bounds[0] + self.by_greatest * bounds[1]
-        return np.asarray(self.by_keypoints @ target + of_box)
+        of_box = self.minimum_weights * bounds[0] + self.maximum_weights * bounds[1]
+        return np.asarray(self.keypoint_weights @ target + of_box)
 
 
 def linear_warp(points: FloatArray, box: FloatArray, source: FloatArray) -> LinearWarp:

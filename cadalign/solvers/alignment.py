@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import borrowing, inlined, kernel
+from cadalign.compile import borrow, inline, kernel
 from cadalign.solvers.constants import UNKNOWNS, UNOBSERVABLE, ScalePrior
 from cadalign.solvers.evidence import (
     BLOCK,
@@ -69,7 +69,7 @@ def _allocate(objective: Objective) -> tuple[Equations, Equations]:
 
 
 @evaluate.of(Objective)
-@borrowing
+@borrow
 def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equations) -> float:
     """Write the Gauss-Newton system at a pose (15,), with unit rows for fixed unknowns."""
     hessian, gradient = equations.hessian, equations.gradient
@@ -90,7 +90,7 @@ def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equati
 
 
 @cost_at.of(Objective)
-@borrowing
+@borrow
 def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
     prior = objective.scale_prior
     y, z = excess_of(np.log(pose[13]), prior.width), excess_of(np.log(pose[14]), prior.width)
@@ -98,12 +98,12 @@ def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
 
 
 @solve.of(Objective)
-@inlined
+@inline
 def _solve(objective: Objective, equations: Equations, damping: float, step: FloatArray) -> float:
     return solve_damped(equations, UNKNOWNS, damping, step)
 
 
-@inlined
+@inline
 def solve_damped(equations: Equations, unknowns: int, damping: float, step: FloatArray) -> float:
     """Write the damped step; returns the decrease that it predicts, NaN if singular."""
     hessian, gradient, factor = equations.hessian, equations.gradient, equations.factor
@@ -122,7 +122,7 @@ def solve_damped(equations: Equations, unknowns: int, damping: float, step: Floa
 
 
 @move.of(Objective)
-@inlined
+@inline
 def _move(
     objective: Objective,
     pose: FloatArray,
@@ -135,7 +135,7 @@ def _move(
 
 
 @score_of.of(Objective)
-@inlined
+@inline
 def _score_of(objective: Objective, pose: FloatArray, cost: float) -> float:
     return cost
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import borrowing, inlined, kernel
+from cadalign.compile import borrow, inline, kernel
 from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.linalg import Triple, add_products, copy_into
 from cadalign.solvers.projection import Scalars, project_point, scalars_of, write_derivatives
@@ -36,7 +36,7 @@ class KeypointEvidence(NamedTuple):
     loss_scale: float
 
 
-@inlined
+@inline
 def add_keypoints(
     keypoints: KeypointEvidence,
     pose: FloatArray,
@@ -55,7 +55,7 @@ def add_keypoints(
     return cost
 
 
-@borrowing
+@borrow
 def _write_rows(
     keypoints: KeypointEvidence, pose: FloatArray, start: int, size: int, rows: FloatArray
 ) -> float:
@@ -95,7 +95,7 @@ class Weight(NamedTuple):
     whitening: Triple
 
 
-@inlined
+@inline
 def weigh_error(weights: Triple, du: float, dv: float, loss: int, loss_scale: float) -> Weight:
     """Whiten an error (du, dv) of a ray, and weight it by the loss."""
     u, v = weights[0] * du + weights[1] * dv, weights[2] * dv
@@ -104,7 +104,7 @@ def weigh_error(weights: Triple, du: float, dv: float, loss: int, loss_scale: fl
     return Weight(cost, root, root * u, root * v, whitening)
 
 
-@inlined
+@inline
 def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]:
     """Loss of a squared residual, and the square root of the residual's weight."""
     if loss == LINEAR:
@@ -118,7 +118,7 @@ def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]
     return scale * scale * np.log1p(ratio), np.sqrt(1.0 / (1.0 + ratio))
 
 
-@inlined
+@inline
 def weight_slope(loss: int, scale: float, root: float, square: float) -> float:
     """Change of log(root) per r' dr, with the weight's ``root`` and weighted residuals r."""
     if loss == LINEAR or root == 1.0:
@@ -126,7 +126,7 @@ def weight_slope(loss: int, scale: float, root: float, square: float) -> float:
     return -0.5 / square if loss == HUBER else -1.0 / (scale * scale)
 
 
-@inlined
+@inline
 def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
     """Squared whitened residual of keypoint i; infinite behind the camera."""
     points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
@@ -138,7 +138,7 @@ def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
     return square if depth > 0 else np.inf
 
 
-@borrowing
+@borrow
 def keypoint_cost(keypoints: KeypointEvidence, pose: FloatArray) -> float:
     """Cost of the keypoints; infinite if a point lies behind the camera."""
     scalars = scalars_of(pose)
@@ -165,12 +165,12 @@ def take_keypoints(keypoints: KeypointEvidence, chosen: IntArray) -> KeypointEvi
     return KeypointEvidence(points, rays, whitening, keypoints.loss, keypoints.loss_scale)
 
 
-@inlined
+@inline
 def excess_of(value: float, width: float) -> float:
     return value - min(max(value, -width), width)
 
 
-@inlined
+@inline
 def add_scale_prior(
     prior: ScalePrior, pose: FloatArray, hessian: FloatArray, gradient: FloatArray
 ) -> float:
@@ -195,7 +195,7 @@ def whole_information(prior: ScalePrior) -> float:
     return float((width + half) / square)
 
 
-@inlined
+@inline
 def score_of_distance(distance: float) -> float:
     """-2 log of the translation prior |t|^-3, uniform in direction and log distance."""
     return float(6.0 * np.log(distance))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import fast_sums, inlined, kernel
+from cadalign.compile import fast_sums, inline, kernel
 
 Triple = tuple[float, float, float]
 
@@ -14,43 +14,43 @@ LEAST_INFORMATION = 1e-15
 """Least information about an unknown, relative to the largest."""
 
 
-@inlined
+@inline
 def add(a: Triple, b: Triple) -> Triple:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@inlined
+@inline
 def subtract(a: Triple, b: Triple) -> Triple:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@inlined
+@inline
 def multiply(a: Triple, factor: float) -> Triple:
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-@inlined
+@inline
 def normalize(a: Triple) -> Triple:
     return multiply(a, 1.0 / np.sqrt(dot(a, a)))
 
 
-@inlined
+@inline
 def cross(a: Triple, b: Triple) -> Triple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@inlined
+@inline
 def dot(a: Triple, b: Triple) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined
+@inline
 def triple(row: FloatArray) -> Triple:
     """The first three numbers of a row."""
     return row[0], row[1], row[2]
 
 
-@inlined
+@inline
 def second_moments(points: FloatArray) -> tuple[float, float, float, float, float, float]:
     """Sums of xx, xy, xz, yy, yz and zz over points (n, 3)."""
     xx = xy = xz = yy = yz = zz = 0.0
@@ -76,7 +76,7 @@ def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: 
                 gradient[k] += total
 
 
-@inlined
+@inline
 def mirror_upper(matrix: FloatArray) -> None:
     """Copy the upper triangle of a matrix to the lower one."""
     for k in range(matrix.shape[0]):
@@ -175,14 +175,14 @@ def solve_factor_rows(factor: FloatArray, right: FloatArray) -> None:
                     other[c] -= share * own[c]
 
 
-@inlined
+@inline
 def copy_into(target: FloatArray, source: FloatArray) -> None:
     """Copy a vector; ``target[:] = source`` would compile Numba's code for error messages."""
     for k in range(target.shape[0]):
         target[k] = source[k]
 
 
-@inlined
+@inline
 def expected_decrease(gradient: FloatArray, step: FloatArray, size: int) -> float:
     """Predicted decrease of the cost by a Gauss-Newton step."""
     expected = 0.0

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 from cadalign.solvers.constants import POSE_SIZE
 from cadalign.solvers.linalg import (
     Triple,
@@ -122,7 +122,7 @@ def solve_subset(
     return _solve_four(memory, solutions)
 
 
-@inlined
+@inline
 def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, row: int) -> None:
     direction = normalize(ray)
     for c in range(3):
@@ -130,7 +130,7 @@ def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, ro
         memory[_RAYS + row, c] = direction[c]
 
 
-@inlined
+@inline
 def _solve_four(memory: FloatArray, solutions: FloatArray) -> int:
     if not _column_weights(memory):
         return 0
@@ -144,7 +144,7 @@ def _solve_four(memory: FloatArray, solutions: FloatArray) -> int:
     return count
 
 
-@inlined
+@inline
 def _column_weights(memory: FloatArray) -> bool:
     """Write the weights of camera-frame points in the columns of R diag(s); False if coplanar."""
     a, b, c = _difference(memory, 1), _difference(memory, 2), _difference(memory, 3)
@@ -163,12 +163,12 @@ def _column_weights(memory: FloatArray) -> bool:
     return True
 
 
-@inlined
+@inline
 def _difference(memory: FloatArray, i: int) -> Triple:
     return subtract(_triple(memory, _SAMPLE + i), _triple(memory, _SAMPLE))
 
 
-@inlined
+@inline
 def _split_columns(memory: FloatArray) -> None:
     """Write the columns' derivatives by the unknowns: column j is the sum of e_k times row 4 j + k.
 
@@ -188,7 +188,7 @@ def _split_columns(memory: FloatArray) -> None:
                 memory[_PARTS + 4 * j + k, c] = part[k]
 
 
-@inlined
+@inline
 def _orthogonality_quadrics(memory: FloatArray) -> None:
     """Write the quadrics that vanish for orthogonal columns, with largest coefficient 1."""
     for row in range(3):
@@ -208,7 +208,7 @@ def _orthogonality_quadrics(memory: FloatArray) -> None:
             memory[QUADRICS + row, entry] *= scale
 
 
-@inlined
+@inline
 def _triple(memory: FloatArray, row: int) -> Triple:
     return memory[row, 0], memory[row, 1], memory[row, 2]
 
@@ -252,7 +252,7 @@ def _pack_solution(memory: FloatArray, row: int, solutions: FloatArray, count: i
     return True
 
 
-@inlined
+@inline
 def _column(matrix: FloatArray, j: int) -> Triple:
     return matrix[0, j], matrix[1, j], matrix[2, j]
 
@@ -320,12 +320,12 @@ def p3p_kernel(
     return count
 
 
-@inlined
+@inline
 def _unit_ray(rays: FloatArray, i: int) -> Triple:
     return normalize((rays[i, 0], rays[i, 1], 1.0))
 
 
-@inlined
+@inline
 def _squared_distance(first: Triple, second: Triple) -> float:
     difference = subtract(first, second)
     return dot(difference, difference)
@@ -347,7 +347,7 @@ def _pack_motion(
     return bool(np.isfinite(pose).all())
 
 
-@inlined
+@inline
 def _frame(corners: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
     """Axes of a triangle: along a side, in its plane, and along its normal."""
     x = normalize(subtract(corners[2], corners[0]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 
 _HALVINGS = 40
 _REFRESH_PERIOD = 3  # halvings after which the first interval's coefficients are recomputed
@@ -15,7 +15,7 @@ ROOTS_ROWS = _HALVINGS + 3
 """Rows of memory for `real_roots`: coefficients, roots, Bernstein coefficients of intervals."""
 
 
-@inlined
+@inline
 def real_roots(memory: FloatArray, first: int, degree: int, reach: float, touching: float) -> int:
     """Write the real roots of a polynomial in (-reach, reach); returns their number.
 
@@ -34,7 +34,7 @@ def real_roots(memory: FloatArray, first: int, degree: int, reach: float, touchi
     return found
 
 
-@inlined
+@inline
 def _roots_up_to(
     memory: FloatArray, first: int, degree: int, end: float, touching: float, found: int
 ) -> int:
@@ -77,7 +77,7 @@ def _roots_up_to(
         top -= 1
 
 
-@inlined
+@inline
 def _evaluate(memory: FloatArray, row: int, degree: int, x: float) -> tuple[float, float]:
     """Value and derivative by Horner's rule."""
     value = memory[row, degree]
@@ -110,7 +110,7 @@ def _root_between(memory: FloatArray, row: int, degree: int, low: float, high: f
     return x
 
 
-@inlined
+@inline
 def _to_bernstein(memory: FloatArray, first: int, degree: int, end: float, top: int) -> None:
     """Write the Bernstein coefficients on the interval from zero to ``end`` into row ``top``."""
     memory[top, 0] = memory[first, 0]
@@ -123,7 +123,7 @@ def _to_bernstein(memory: FloatArray, first: int, degree: int, end: float, top: 
             memory[top, k] += memory[top, k - 1]
 
 
-@inlined
+@inline
 def _halve(memory: FloatArray, top: int, degree: int) -> None:
     """Halve by de Casteljau's algorithm: row ``top`` keeps the outer half, the next the inner."""
     for i in range(degree + 1):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, UNKNOWNS
 from cadalign.solvers.linalg import Triple, cross, dot
 from cadalign.solvers.unknowns import is_pose
@@ -20,20 +20,20 @@ Scalars = tuple[float, ...]
 Motion = tuple[float, ...] | FloatArray
 
 
-@inlined
+@inline
 def motion_of(pose: FloatArray) -> Motion:
     """Rotation and translation of a packed pose, as a tuple of 12 numbers."""
     rotation = (pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6], pose[7], pose[8])
     return rotation + (pose[9], pose[10], pose[11])
 
 
-@inlined
+@inline
 def scalars_of(pose: FloatArray) -> Scalars:
     """A packed pose as a tuple of 15 numbers."""
     return motion_of(pose) + (pose[12], pose[13], pose[14])
 
 
-@inlined
+@inline
 def turn(motion: Motion, point: Triple) -> Triple:
     """Rotate a point."""
     x, y, z = point
@@ -44,7 +44,7 @@ def turn(motion: Motion, point: Triple) -> Triple:
     )
 
 
-@inlined
+@inline
 def turn_back(motion: Motion, slope: Triple) -> Triple:
     """Convert a slope by the rotated point to one by the point: multiply by the transpose."""
     x, y, z = slope
@@ -55,20 +55,20 @@ def turn_back(motion: Motion, slope: Triple) -> Triple:
     )
 
 
-@inlined
+@inline
 def shift(motion: Motion, turned: Triple) -> Triple:
     """Add the translation to a rotated point."""
     return turned[0] + motion[9], turned[1] + motion[10], turned[2] + motion[11]
 
 
-@inlined
+@inline
 def ray_of(point: Triple) -> Triple:
     """Normalised image coordinates u, v and depth of a point in the camera."""
     inverse = 1.0 / point[2]
     return point[0] * inverse, point[1] * inverse, point[2]
 
 
-@inlined
+@inline
 def ray_slopes(seen: Triple, weights: Triple) -> tuple[Triple, Triple]:
     """Slopes of a u + b v and c v for ``weights`` (a, b, c), at the result of `ray_of`."""
     u, v, depth = seen
@@ -77,7 +77,7 @@ def ray_slopes(seen: Triple, weights: Triple) -> tuple[Triple, Triple]:
     return (e, f, -(e * u + f * v)), (0.0, h, -h * v)
 
 
-@inlined
+@inline
 def slope_of_row(
     row: Triple, along: float, response: Triple, nearer: Triple, fall: float
 ) -> Triple:
@@ -101,26 +101,26 @@ def slope_of_row(
     )
 
 
-@inlined
+@inline
 def write_motion(turned: Triple, slope: Triple, rows: FloatArray, column: int) -> None:
     """Write derivatives by rotation vector and translation into ``rows[:6, column]``."""
     rows[0, column], rows[1, column], rows[2, column] = cross(turned, slope)
     rows[3, column], rows[4, column], rows[5, column] = slope
 
 
-@inlined
+@inline
 def project_point(pose: Scalars, point: Triple) -> Triple:
     """Project a model point to normalised image coordinates u, v and depth."""
     return ray_of(shift(pose, turn(pose, stretch(pose, point))))
 
 
-@inlined
+@inline
 def stretch(pose: Scalars, point: Triple) -> Triple:
     """Multiply a point by the scale of a packed pose."""
     return point[0] * pose[12], point[1] * pose[13], point[2] * pose[14]
 
 
-@inlined
+@inline
 def write_derivatives(
     pose: Scalars,
     point: Triple,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 from cadalign.solvers.linalg import Triple, add, cross, dot, subtract
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 
@@ -40,7 +40,7 @@ INTERSECTION_ROWS = _POLYNOMIAL + ROOTS_ROWS
 """Rows of memory (16 numbers each) for `intersect_quadrics`."""
 
 
-@inlined
+@inline
 def intersect_quadrics(memory: FloatArray) -> int:
     """Intersect three quadrics in points e with positive depths H e / 2; returns their number.
 
@@ -76,20 +76,20 @@ def intersect_quadrics(memory: FloatArray) -> int:
     return found
 
 
-@inlined
+@inline
 def hadamard(a: float, b: float, c: float, d: float) -> Quadruple:
     """Multiply (a, b, c, d) by half the Hadamard matrix H, an involution: mean and differences."""
     s, t, u, v = a + c, b + d, a - c, b - d
     return 0.5 * (s + t), 0.5 * (s - t), 0.5 * (u + v), 0.5 * (u - v)
 
 
-@inlined
+@inline
 def _least_depth(memory: FloatArray, row: int) -> float:
     a, b, c, d = hadamard(memory[row, 0], memory[row, 1], memory[row, 2], memory[row, 3])
     return min(min(a, b), min(c, d))
 
 
-@inlined
+@inline
 def _are_one_root(memory: FloatArray, row: int, other: int) -> bool:
     difference = 0.0
     for i in range(1, 4):
@@ -97,18 +97,18 @@ def _are_one_root(memory: FloatArray, row: int, other: int) -> bool:
     return difference < _SAME_POINT
 
 
-@inlined
+@inline
 def _entry(i: int, j: int) -> int:
     low, high = min(i, j), max(i, j)
     return low * 4 - low * (low - 1) // 2 + high - low
 
 
-@inlined
+@inline
 def _quadric(memory: FloatArray, k: int) -> Triple:
     return memory[QUADRICS, k], memory[QUADRICS + 1, k], memory[QUADRICS + 2, k]
 
 
-@inlined
+@inline
 def _solve_for_monomials(memory: FloatArray, x: int, y: int, z: int) -> None:
     """Solve for y^2, yz, z^2: write coefficients of 1, x, x^2, y, xy, z, xz from row `_TABLE`."""
     products = (0, x, _entry(x, x), y, _entry(x, y), z, _entry(x, z))
@@ -124,7 +124,7 @@ def _solve_for_monomials(memory: FloatArray, x: int, y: int, z: int) -> None:
         memory[_TABLE + 2, k] = scale * dot(ab, column)
 
 
-@inlined
+@inline
 def _eliminate(memory: FloatArray) -> None:
     """Write three equations linear in y and z, and their determinant, of degree 8 in x.
 
@@ -174,17 +174,17 @@ def _eliminate(memory: FloatArray) -> None:
             memory[_POLYNOMIAL, i + k] += (w[i] - other_w[i]) * w3[k]
 
 
-@inlined
+@inline
 def _line(memory: FloatArray, row: int, first: int) -> Pair:
     return memory[_TABLE + row, first], memory[_TABLE + row, first + 1]
 
 
-@inlined
+@inline
 def _parabola(memory: FloatArray, row: int) -> Triple:
     return memory[_TABLE + row, 0], memory[_TABLE + row, 1], memory[_TABLE + row, 2]
 
 
-@inlined
+@inline
 def _write_row(memory: FloatArray, row: int, values: Quintuple) -> None:
     for k in range(5):
         memory[_SYSTEM + row, k] = values[k]
@@ -211,13 +211,13 @@ def _back_substitute(memory: FloatArray, x: float) -> tuple[float, float]:
     return y, z
 
 
-@inlined
+@inline
 def _evaluate_row(memory: FloatArray, row: int, x: float) -> float:
     m, r = memory, _SYSTEM + row
     return float(m[r, 0] + x * (m[r, 1] + x * (m[r, 2] + x * (m[r, 3] + x * m[r, 4]))))
 
 
-@inlined
+@inline
 def _half_gradient(memory: FloatArray, r: int, b: float, c: float, d: float) -> Quadruple:
     """Half the gradient of a quadric at (1, b, c, d); times the point it gives the value."""
     q = memory
@@ -271,27 +271,27 @@ def _polish(memory: FloatArray, row: int) -> bool:
 # Sums and products of polynomials, constant first; a name ends in the numbers of coefficients.
 
 
-@inlined
+@inline
 def _add_4(p: Quadruple, q: Quadruple) -> Quadruple:
     return p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3]
 
 
-@inlined
+@inline
 def _add_5(p: Quintuple, q: Quintuple) -> Quintuple:
     return p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3], p[4] + q[4]
 
 
-@inlined
+@inline
 def _subtract_4(p: Quadruple, q: Quadruple) -> Quadruple:
     return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3]
 
 
-@inlined
+@inline
 def _multiply_22(p: Pair, q: Pair) -> Triple:
     return p[0] * q[0], p[0] * q[1] + p[1] * q[0], p[1] * q[1]
 
 
-@inlined
+@inline
 def _multiply_23(p: Pair, q: Triple) -> Quadruple:
     return (
         p[0] * q[0],
@@ -301,7 +301,7 @@ def _multiply_23(p: Pair, q: Triple) -> Quadruple:
     )
 
 
-@inlined
+@inline
 def _multiply_33(p: Triple, q: Triple) -> Quintuple:
     return (
         p[0] * q[0],
@@ -312,7 +312,7 @@ def _multiply_33(p: Triple, q: Triple) -> Quintuple:
     )
 
 
-@inlined
+@inline
 def _multiply_34(p: Triple, q: Quadruple) -> Sextuple:
     return (
         p[0] * q[0],

@@ -4,11 +4,11 @@ A system is a NamedTuple of the evidence and priors of one object. Its state is 
 (D,) in a layout of its own; a step is a vector of its unknowns (U,). The families of kernels below
 have one member for each system, in the module of that system:
 
-=========================  =====================================================================
-`alignment.Objective`       pose and stretch from the keypoints of one view
-`marginal.equations.Posed`  a pose, the shape integrated out
-`joint.system.Joint`        poses, scales, focal lengths and shape from all evidence
-=========================  =====================================================================
+=============================  ====================================================================
+`alignment.Objective`          pose and stretch from the keypoints of one view
+`marginal.equations.Marginal`  a pose, the shape integrated out
+`joint.system.Joint`           poses, scales, focal lengths and shape from all evidence
+=============================  ====================================================================
 
 A cost is -2 log (likelihood times prior), up to a constant, and infinite behind a camera. Equations
 hold half the gradient of the cost, J' W r, and its Gauss-Newton matrix, J' W J.
@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import borrowing, kernel, kernel_family
+from cadalign.compile import borrow, kernel, kernel_family
 from cadalign.solvers.linalg import copy_into
 
 allocate = kernel_family("allocate")
@@ -69,7 +69,7 @@ def refine(system: Any, max_iterations: int, state: FloatArray) -> tuple[float, 
     return _levenberg_marquardt(system, max_iterations, state, state.copy(), step, current, new)
 
 
-@borrowing
+@borrow
 def _levenberg_marquardt(
     system: Any,
     max_iterations: int,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 from cadalign.solvers.linalg import polish_rotation
 
 _LARGEST_LOG_STEP = 2.0
@@ -29,7 +29,7 @@ def pack_pose(
         pose[12 + i] = scale[i]
 
 
-@inlined
+@inline
 def move_rigid(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
     """Write rotation and translation after a step of their 6 unknowns."""
     angle2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]

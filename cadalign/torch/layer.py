@@ -23,7 +23,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.problems import Problems, in_threads, join_problems, rays_of
+from cadalign.estimation.problems import Problems, join_problems, rays_of, run_in_threads
 from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import OK
@@ -70,7 +70,7 @@ class FitTask:
             raise InputError(what, where="camera", fix="undistort keypoints and camera first")
         if not all(each.focal_known for each in self.cameras):
             what = "the focal length is unknown"
-            raise InputError(what, where="camera", fix="give it: camera.with_focal(...)")
+            raise InputError(what, where="camera", fix="give it: camera.replace_focal(...)")
 
 
 class _FirstOrder(torch.autograd.Function):
@@ -226,7 +226,7 @@ def _search(
     def fit_alone(b: int) -> None:
         part = replace(options, sigma=sigmas[b, present[b]])
         with suppress(CadalignError):
-            poses[b] = fit_once(problems[b], part, None, None, 0.0).alignment.packed
+            poses[b] = fit_once(problems[b], part, None, None, 0.0).alignment.vector
             valid[b] = True
 
     @np.errstate(all="ignore")  # NumPy keeps this state per thread
@@ -240,5 +240,5 @@ def _search(
         solved = first + np.flatnonzero(found.statuses == OK)
         poses[solved], valid[solved] = found.poses[solved - first, 0], True
 
-    in_threads(run, len(points), task.workers)
+    run_in_threads(run, len(points), task.workers)
     return poses, valid

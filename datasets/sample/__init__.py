@@ -14,10 +14,10 @@ from cadalign.arrays import require_counts
 from cadalign.datasets.sample.kinds import bottle, car, chair, vessel
 from cadalign.datasets.sample.parts import has_area
 from cadalign.datasets.shapenet import SYNSETS
-from cadalign.errors import DataError, unknown
+from cadalign.errors import DataError, unknown_name
 from cadalign.geometry.mesh import Mesh, join
 from cadalign.io.documents import read_json
-from cadalign.io.files import as_path, dense_json, writing_folder
+from cadalign.io.files import as_path, dense_json, write_folder
 from cadalign.io.meshes.files import write_mesh
 
 MAKERS = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}
@@ -65,7 +65,7 @@ def write_sample_dataset(
     target, names = as_path(root, "root"), list(dict.fromkeys(categories or MAKERS))
     for name in names:
         if name not in MAKERS:
-            raise unknown("category", name, MAKERS, where="categories")
+            raise unknown_name("category", name, MAKERS, where="categories")
     made_of = {"categories": names, "per_category": int(per_category)}
     if target.is_file() or (target.is_dir() and any(target.iterdir())):
         if (target / _MARKER).is_file() and read_json(target / _MARKER) == made_of:
@@ -74,7 +74,7 @@ def write_sample_dataset(
         raise DataError(what, where=str(target), fix="give a new or an empty folder")
     splits: dict[str, str] = dict.fromkeys(_SPLITS, "")
     annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    with writing_folder(target) as data:
+    with write_folder(target) as data:
         for name, index in product(names, range(per_category)):
             mesh, entry = make_model(name, index)
             annotations[name].append(entry)

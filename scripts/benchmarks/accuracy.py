@@ -1,9 +1,6 @@
-"""Accuracy of the solvers relative to the Cramer-Rao bound, and times with learned shapes."""
+"""Accuracy of the solvers relative to the Cramer-Rao bound."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
@@ -20,8 +17,6 @@ _ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (102
 _METHODS = ("optimal", "aepnp", "aepnp-paper")
 _LIMIT_DRAWS = 20  # errors of an ideal estimator per problem
 _SCALE_X = 6  # row of a bound
-_CATEGORIES = ("chair", "airplane", "mug")
-_NOISE_PX = 2.0  # of unseen objects
 
 
 def accuracy(given: BenchmarkData) -> Tables:
@@ -68,37 +63,3 @@ def _ideal_errors(bound: FloatArray, rng: np.random.Generator) -> FloatArray:
     own, mean = bound[np.ix_(free, free)], np.zeros(len(free))
     errors = rng.multivariate_normal(mean, own, size=_LIMIT_DRAWS, method="eigh")
     return np.degrees(np.linalg.norm(errors[:, :3], axis=1))
-
-
-# Learned shapes -----------------------------------------------------------------------------------
-
-
-def shapes(given: BenchmarkData) -> Tables:
-    """Times of `align` with a learned shape, for one view and for a batch.
-
-    Objects are from the split val, with up to 14 noisy keypoints; shape models are learned from the
-    split train. Times of single views are processor times after warm-up, on one thread. The batch
-    holds every object five times and uses two threads.
-    """
-    yield "align with a learned shape", _shape_times(given)
-
-
-def _shape_times(given: BenchmarkData) -> Iterator[Row]:
-    root = given.folder("keypointnet")
-    for category in _CATEGORIES:
-        shape = section.learned_shape(root, category)
-        how = {"keypoints": 14, "noise_px": _NOISE_PX}
-        found = section.unseen_objects(root, category, given.count or 40, **how)
-        views = [seen.view_of(shape) for _, seen in found]
-        for view in views[:2]:  # compile
-            cadalign.align(shape, view)
-        calls = (partial(cadalign.align, shape, view) for view in views)
-        one = [1e3 * section.clock(call)[1] for call in calls]
-        batch = [[view] for view in views] * 5
-        call = partial(cadalign.align_batch, shape, batch, workers=2)
-        yield {
-            "category": category,
-            "components": len(shape.components),
-            "one view ms": section.spread(one),
-            "batch 1/s": len(batch) / section.seconds(call),
-        }

@@ -22,7 +22,7 @@ from cadalign.arrays import FloatArray
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.images import photo_size
 from cadalign.metrics import box_iou
-from cadalign.shapes.basis import find_mirror, mirrored
+from cadalign.shapes.basis import find_mirror, mirror_rows
 
 _LEAST_KEYPOINTS, _SURE = 6, 0.4  # score of a keypoint
 _CELLS = 64  # cells of the network's heatmap along the longer side of a car's rectangle
@@ -123,8 +123,8 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
     # The mean of annotated cars is slightly asymmetric, so it is averaged with its mirror image.
     rows = np.vstack([points, _car_bounds(points)])
     mirror = find_mirror(rows[None], axis=0)
-    moved = mirrored(rows + np.pad(modes, ((0, 0), (0, 2), (0, 0))), mirror)
-    image = mirrored(rows[None], mirror)[0]
+    moved = mirror_rows(rows + np.pad(modes, ((0, 0), (0, 2), (0, 0))), mirror)
+    image = mirror_rows(rows[None], mirror)[0]
     mean, images = (rows + image) / 2, (moved - image)[:, :-2]
     return cadalign.ShapeModel.from_basis(
         mean[:-2],

@@ -112,7 +112,7 @@ def _ransac(given: BenchmarkData) -> Iterator[Row]:
                 call = partial(section.attempt, cadalign.fit, *problem, ransac=options)
                 wall, _, result = section.clock(call)
                 ours.append(wall)
-                known = MethodInput.of_problem(truth, 1.0)
+                known = MethodInput.from_problem(truth, 1.0)
                 succeeded.append(result is not None and errors_of(result, known)["success"])
                 poselibs.append(section.seconds(_poselib(image, truth.points_2d, iterations)))
         own, other = float(np.median(ours)), float(np.median(poselibs))

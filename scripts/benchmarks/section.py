@@ -46,6 +46,8 @@ class BenchmarkData:
     """Seed of the random number generators."""
     count: int | None = None
     """Number of problems, objects, queries or calls per row; the default depends on the section."""
+    split: str = "val"
+    """Split of the objects of the section shapes."""
     sizes: tuple[int, ...] = (50_000,)
     """Numbers of models in the synthetic libraries of the section retrieval."""
     sections: tyro.conf.Positional[tuple[str, ...]] = ()
@@ -148,13 +150,14 @@ def learned_shape(root: Path, category: str) -> cadalign.ShapeModel:
 def unseen_objects(
     root: Path, category: str, count: int, **options: Any
 ) -> Iterator[tuple[int, UnseenObject]]:
-    """Up to ``count`` objects, evenly chosen from the split val, each with its index.
+    """Up to ``count`` objects, drawn from a split, each with its index.
 
     ``options`` are those of `cadalign evaluate unseen`.
     """
     chosen = UnseenOptions(root=root, categories=(category,), **options)
     tasks = unseen_tasks(KeypointNet(root), chosen)
-    for place in range(0, len(tasks), -(-len(tasks) // count)):
+    drawn = np.random.default_rng(chosen.seed).permutation(len(tasks))[:count]
+    for place in sorted(drawn.tolist()):
         seen = attempt(observe_object, tasks[place], chosen)
         if seen is not None:
             yield place, seen

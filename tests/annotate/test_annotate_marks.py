@@ -13,7 +13,7 @@ from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 
-CAMERA = Camera.without_focal(640, 480)
+CAMERA = Camera.drop_focal(640, 480)
 EMPTY = Marks(CAMERA)
 
 
@@ -88,7 +88,7 @@ def edited(marks: Marks, edit: int, which: int) -> Marks:
         return marks.move(number, (float(which), 2.0))
     if edit == 3:
         return marks.delete(number)
-    return replace(marks, camera=CAMERA.with_focal(100.0 + which))
+    return replace(marks, camera=CAMERA.replace_focal(100.0 + which))
 
 
 @pytest.mark.long

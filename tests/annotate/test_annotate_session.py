@@ -115,7 +115,7 @@ def test_unfinished_halves_are_in_the_observation_while_there_are_any(case: Case
     assert unfinished() == {"pairs": [{"uv": [10, 20]}, {"uv": [30, 40]}]}
     perform(session, 0, {"do": "place_keypoint", "keypoint": 0})
     assert unfinished() == {"pairs": [{"uv": [30, 40]}]}
-    assert Observation.load(case.observation).unfinished == unfinished()
+    assert Observation.load(case.observation).draft == unfinished()
     perform(session, 0, {"do": "delete", "pair": 2})
     assert unfinished() is None
 

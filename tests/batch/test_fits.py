@@ -62,7 +62,7 @@ def test_lines_become_results_in_their_order(tmp_path: Path) -> None:
         expected = cadalign.fit(each.points_3d, each.points_2d, CAMERA, loss="cauchy")
         single = found[number]
         assert isinstance(single, Result)
-        np.testing.assert_array_equal(single.alignment.packed, expected.alignment.packed)
+        np.testing.assert_array_equal(single.alignment.vector, expected.alignment.vector)
         np.testing.assert_allclose(found.rotation[number], expected.alignment.rotation)
         np.testing.assert_allclose(found.scale[number], expected.alignment.scale)
         assert single.covariance is not None

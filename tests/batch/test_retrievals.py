@@ -89,7 +89,7 @@ def test_the_table_holds_the_best_match_of_each(
         np.testing.assert_allclose(scores, [match.score for match in expected], rtol=1e-3)
         assert isinstance(single, Result)
         np.testing.assert_allclose(
-            single.alignment.packed, expected[0].alignment.packed, rtol=1e-12
+            single.alignment.vector, expected[0].alignment.vector, rtol=1e-12
         )
     page = embedded_payload(run / "report.html")
     assert page["title"] == "Retrieved models"
@@ -143,7 +143,7 @@ def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:
     assert (result.method, result.rms) == ("retrieve", pytest.approx(match.rms))
     np.testing.assert_array_equal(result.box.corners, match.box.corners)
     again = Result.from_dict(result.to_dict())
-    np.testing.assert_array_equal(again.alignment.packed, match.alignment.packed)
+    np.testing.assert_array_equal(again.alignment.vector, match.alignment.vector)
     paired = match.observation(seen)
     assert paired.model == match.mesh_path
     assert paired.names == seen.names

@@ -122,7 +122,11 @@ def test_table_goes_to_standard_output(
 def test_without_a_root_the_sample_data_set_is_made(tmp_path: Path) -> None:
     options = ["--out", str(tmp_path), "--per-category", "1", "--categories", "bottle"]
     assert main(["demo", *options]) == 0
-    assert [row["status"] for row in rows_of(tmp_path)] == ["ok"]
+    model, shape = rows_of(tmp_path)
+    assert [model["category"], shape["category"]] == ["bottle", "bottle, learned shape"]
+    assert model["status"] == shape["status"] == "ok"
+    assert float(shape["sym_rotation_error_deg"]) < 5
+    assert picture_of(tmp_path, shape).with_stem(f"{picture_of(tmp_path, shape).stem}_1").exists()
     made = KeypointNet(tmp_path / "sample_dataset")
     assert {category: len(made.ids(category)) for category in made.categories} == dict.fromkeys(
         CATEGORIES, 12

@@ -63,7 +63,7 @@ def test_the_command_says_what_is_missing(
     assert main(["fit", str(observed), "--no-picture"]) == 0
     result, to = tmp_path / "photo_fit" / "fit.json", ("--to", tmp_path / "a.glb")
     said = refusal(capsys, result, "--to", tmp_path / "a.json")
-    assert "the name does not tell the format" in said
+    assert "the ending '.json' is not an export format; the formats are .glb, .obj, .ply" in said
     Result.load(result).save(result)  # which writes no observation
     assert "the file holds no fit with its observation" in refusal(capsys, result, *to)
     result.write_text(result.read_text()[:200])

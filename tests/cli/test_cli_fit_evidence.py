@@ -64,6 +64,7 @@ def test_gravity_and_size_are_used_as_by_align(
     names = [each.name for each in expected.evidence]
     assert names == ["views[0].points_2d", "views[0].up", "size"]
     assert all(f"  evidence     {each}\n" in f"{expected}\n" for each in expected.evidence)
+    assert str(expected.evidence[-1]) == "size: sets the unit of lengths"
 
 
 @pytest.mark.slow
@@ -109,7 +110,7 @@ def test_keypoints_without_ids_are_the_same_at_the_same_point(tmp_path: Path) ->
     np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-6)
 
 
-def without_focal(path: Path) -> Path:
+def drop_focal(path: Path) -> Path:
     """Remove the focal lengths from the cameras of a file."""
     data = json.loads(path.read_text())
     for image in data.get("views", [data]):
@@ -121,9 +122,9 @@ def without_focal(path: Path) -> Path:
 def test_unknown_focal_length_of_two_views_is_estimated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = without_focal(write(tmp_path, observed(0.0), observed(25.0)))
+    path = drop_focal(write(tmp_path, observed(0.0), observed(25.0)))
     assert main(["fit", str(path)]) == 0
-    unknown = Camera.without_focal(640, 480)
+    unknown = Camera.drop_focal(640, 480)
     views = [View(unknown, observed(angle).points_2d) for angle in (0.0, 25.0)]
     expected = align(Model(points_3d=POINTS), views, focal="estimate")
     found = result_in(tmp_path)
@@ -140,7 +141,7 @@ def test_prior_of_the_photo_is_used(tmp_path: Path, capsys: pytest.CaptureFixtur
     exif[0x8769] = {0xA405: 28}  # focal length in 35 mm film
     Image.new("RGB", (640, 480)).save(photo, exif=exif)
     images = [replace(observed(turn), image=photo) for turn in (0.0, 25.0)]
-    path = without_focal(write(tmp_path, *images))
+    path = drop_focal(write(tmp_path, *images))
     assert main(["fit", str(path), "--no-picture"]) == 0
     assert "+- 5 %, the photo's EXIF data" in capsys.readouterr().err
     path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": {"focal_prior": "usual"}}))
@@ -196,13 +197,14 @@ def test_mask_is_drawn_and_an_inverted_one_named(
     assert (np.abs(picture[..., ::-1].astype(int) - CONTOUR_COLOR).max(axis=2) < 40).sum() > 100
 
 
-def test_mask_alone_is_an_observation(tmp_path: Path) -> None:
+def test_mask_alone_is_an_observation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = truth_of((1.0, 0.7, 1.5))
     write_box(tmp_path, truth)
     nothing, evidence = np.empty((0, 3)), ImageEvidence(mask=tmp_path / "mask.png")
     image = ObservedImage(nothing, nothing[:, :2], CAMERA, evidence=evidence)
     path = write(tmp_path, image, model=tmp_path / "box.obj")
     assert main(["fit", str(path), "--no-picture"]) == 0
+    assert "  evidence     views[0].mask: rms " in capsys.readouterr().out
     found = result_in(tmp_path).alignment
     shown, expected = (
         cast_geometry(Scene(load_mesh(tmp_path / "box.obj")), CAMERA, pose).mask

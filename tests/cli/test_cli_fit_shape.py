@@ -148,7 +148,7 @@ def test_similar_model_is_that_of_the_file(
     assert capsys.readouterr().out == f"{expected}\n"
 
 
-def without_focal(path: Path) -> Path:
+def drop_focal(path: Path) -> Path:
     return edit(path, camera={"width": 640, "height": 480})
 
 
@@ -167,7 +167,7 @@ def test_prior_on_a_focal_length_is_that_of_the_file_and_flags_say_otherwise(
     assert "The focal length is estimated with the prior 905 px +- 1 %" in printed.err
     assert main(["fit", str(path), "--focal", "known"]) == 0
     assert capsys.readouterr().out == f"{align(numbered, view, loss='huber')}\n"
-    path = without_focal(path)
+    path = drop_focal(path)
     assert refusal_line(capsys, "fit", path, "--focal", "known") == (
         f"{path}: camera: the focal length is unknown; "
         "give --focal estimate, or a calibrated camera"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import re
 from functools import cache
 
 import pytest
 
-from cadalign.cli import main
+from cadalign.cli import drop_repeats, main
 
 PATHS = (
     *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
@@ -78,9 +79,24 @@ def test_every_option_is_described(path: str) -> None:
 def test_no_default_is_told_twice(path: str) -> None:
     for name, text in options(path).items():
         stated = re.findall(r"\(default: ([^()]*)\)", text)
-        told = stated and stated[0].strip() not in ("", "None", "False", "True")
+        assert not {"", "None", "False"} & {each.strip() for each in stated}, (name, text)
+        told = stated and stated[0] != "True"
         assert not (told and re.search(r"\bby default\b|\bdefaults? (is|to)\b", text)), (name, text)
         assert len(stated) <= 1, (name, text)
+
+
+def test_lines_of_a_description_are_joined() -> None:
+    start = printed("fit").index("--similar")
+    lines = [line.strip("│ ") for line in printed("fit")[start:].splitlines()[1:4]]
+    assert all(len(line) > 45 for line in lines[:2]), lines
+
+
+def test_a_repeated_warning_is_printed_once() -> None:
+    handler = logging.StreamHandler(out := io.StringIO())
+    handler.addFilter(drop_repeats())
+    for name in ("a.obj", "a.obj", "b.obj"):
+        handler.handle(logging.LogRecord("", logging.WARNING, "", 0, "%s: grey", (name,), None))
+    assert out.getvalue() == "a.obj: grey\nb.obj: grey\n"
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -18,10 +18,10 @@ from cadalign.datasets import (
     join_keypoints,
     read_image_keypoints,
 )
-from cadalign.datasets.image_keypoints import photo_in
+from cadalign.datasets.image_keypoints import find_photo
 from cadalign.errors import CadalignError, DataError, InputError
 
-CAMERA = Camera.without_focal(640, 480)
+CAMERA = Camera.drop_focal(640, 480)
 MODEL = ModelKeypoints(
     (
         ModelKeypoint("left ear", (0.0, 1.0, 0.0), semantic_id=4),
@@ -266,18 +266,18 @@ def test_photos_of_one_name_in_several_folders_are_distinguished(tmp_path: Path)
     (tmp_path / "right").mkdir()
     for name in ("1.jpg", "right/1.jpg", "2.jpg"):
         (tmp_path / name).touch()
-    assert photo_in(tmp_path, "right/1.jpg") == tmp_path / "right/1.jpg"
-    assert photo_in(tmp_path, "data/right/1.jpg") == tmp_path / "right/1.jpg"
-    assert photo_in(tmp_path, "data/right/2.jpg") == tmp_path / "2.jpg"
-    assert photo_in(tmp_path, "3.jpg") is None
-    assert photo_in(tmp_path, "2") == tmp_path / "2.jpg"  # results of detectors have ids
-    assert photo_in(tmp_path, "3") is None
+    assert find_photo(tmp_path, "right/1.jpg") == tmp_path / "right/1.jpg"
+    assert find_photo(tmp_path, "data/right/1.jpg") == tmp_path / "right/1.jpg"
+    assert find_photo(tmp_path, "data/right/2.jpg") == tmp_path / "2.jpg"
+    assert find_photo(tmp_path, "3.jpg") is None
+    assert find_photo(tmp_path, "2") == tmp_path / "2.jpg"  # results of detectors have ids
+    assert find_photo(tmp_path, "3") is None
     coco, outside = tmp_path / "000000000139.jpg", tmp_path / "outside.jpg"
     for path in (coco, outside):
         path.touch()
-    assert photo_in(tmp_path, "139") == coco
-    assert photo_in(tmp_path / "right", str(outside)) is None
-    assert photo_in(tmp_path / "right", "../outside.jpg") is None
+    assert find_photo(tmp_path, "139") == coco
+    assert find_photo(tmp_path / "right", str(outside)) is None
+    assert find_photo(tmp_path / "right", "../outside.jpg") is None
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def test_load_undoes_save_exactly(tmp_path: Path) -> None:
 def test_annotated_model_is_written(sample_root: Path, tmp_path: Path) -> None:
     model = next(iter(KeypointNet(sample_root)["chair"]))
     ids = model.keypoints.ids.tolist()
-    keypoints = ModelKeypoints.of_model(model)
+    keypoints = ModelKeypoints.from_model(model)
     keypoints.save(tmp_path / "chair.keypoints.json")
     again = ModelKeypoints.load(tmp_path / "chair.keypoints.json")
     assert again == keypoints

@@ -20,7 +20,7 @@ from cadalign.datasets import (
 )
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.simulation import simulate_problem
-from cadalign.geometry.pixels import unmeasured
+from cadalign.geometry.pixels import missing_pixels
 from cadalign.io.observation import Observation
 
 COUNT, FOUND = 17, 7
@@ -90,9 +90,9 @@ def test_keypoints_not_found_are_left_out_and_counted(
 def test_measurements_are_kept() -> None:
     """Two keypoints may meet at a pixel, one coordinate may be 0, and a small image is crowded."""
     usual = np.array([[0.0, 20.0], [30, 0], [50, 60], [50, 60], [90, 10], [-1, 4]])
-    assert not unmeasured(usual).any()
-    assert not unmeasured(np.array([[5.0, 5], [5, 5], [5, 5], [9, 9]])).any()
-    assert unmeasured(np.array([[0.0, 0.0], [50, 60]])).tolist() == [False, False]
+    assert not missing_pixels(usual).any()
+    assert not missing_pixels(np.array([[5.0, 5], [5, 5], [5, 5], [9, 9]])).any()
+    assert missing_pixels(np.array([[0.0, 0.0], [50, 60]])).tolist() == [False, False]
 
 
 def test_one_placeholder_of_a_detector_is_enough() -> None:

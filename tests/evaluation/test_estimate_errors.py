@@ -50,7 +50,7 @@ def test_errors_of_many_are_those_of_each_bit_for_bit() -> None:
     symmetries = [NO_SYMMETRY, HALF_TURN] * 32 + [NO_SYMMETRY]
     rows = estimate_errors(estimates, instances, symmetries)
     for est, each, symmetry, row in zip(estimates, instances, symmetries, rows, strict=True):
-        truths = {"": each.gt, "sym_": symmetry.nearest_turned(each.gt, est.rotation)}
+        truths = {"": each.gt, "sym_": symmetry.nearest_pose(each.gt, est.rotation)}
         for prefix, gt in truths.items():
             boxes = {"est": Box.from_model(each.bounds, est), "gt": Box.from_model(each.bounds, gt)}
             expected = {

@@ -13,7 +13,7 @@ import cadalign
 from cadalign import Mesh
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.api import prepared
+from cadalign.evaluation.api import prepare
 from cadalign.evaluation.instances.instance import make_instance
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import as_tuples
@@ -62,7 +62,7 @@ def test_workers_of_a_cluster_may_have_been_started_elsewhere(
         options |= {"categories": ("car",), "max_models": 1}
     monkeypatch.chdir(tmp_path)
     chosen = spec_named(experiment).options(Path("data"), **options)
-    plan, _ = prepared(chosen, RunFolder(Path("run")), workers=None, dask="tcp://nowhere:8786")
+    plan, _ = prepare(chosen, RunFolder(Path("run")), workers=None, dask="tcp://nowhere:8786")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     rows = plan.experiment.evaluate(plan.tasks[:1])

@@ -209,7 +209,7 @@ class TestRows:
             Alignment(np.eye(3), [0, 0, 10], [1, 1.0, 2.0]),
             None,
         )
-        truth = MethodInput.of_problem(problem, 1.0)
+        truth = MethodInput.from_problem(problem, 1.0)
         angle = np.radians(0.4)
         turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
 

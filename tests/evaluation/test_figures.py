@@ -23,7 +23,7 @@ def test_a_pdf_has_truetype_letters_and_the_layout_of_the_png(
         places.append(figure.axes[0].get_position().bounds)
 
     monkeypatch.setattr(Figure, "savefig", noting)
-    trace = Trace.of(0, "optimal", [1.0, 2.0], [0.5, 0.7], ROTATION)
+    trace = Trace.from_values(0, "optimal", [1.0, 2.0], [0.5, 0.7], ROTATION)
     png, pdf = draw_plot(tmp_path / "errors", Plot("errors", NOISE, ROTATION, [trace]))
     assert png.read_bytes().startswith(b"\x89PNG")
     assert b"/FontFile2" in pdf.read_bytes()

@@ -133,7 +133,7 @@ def test_a_run_does_not_continue_without_its_metrics(tmp_path: Path) -> None:
 )
 def test_invalid_metrics_are_refused(function: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
-        FunctionMetric.of(function)
+        FunctionMetric.from_function(function)
     assert str(caught.value) == message
 
 

@@ -46,7 +46,7 @@ def test_accuracy_at_pi_6():
     cells = {"rotation_error_deg": [10.0, 29.9, 30.0, 50.0], "method": ["rigid"] * 4}
     arrays = {name: np.array(values, dtype=object) for name, values in cells.items()}
     (rate,) = (each for each in RATES if each.metric.key == "accuracy_pi_6")
-    assert rate.of(Group(arrays, arrays)) == 0.5
+    assert rate.share(Group(arrays, arrays)) == 0.5
 
 
 def test_a_measure_adds_a_metric() -> None:
@@ -58,7 +58,7 @@ def test_a_measure_adds_a_metric() -> None:
     assert protocol.score(cast(Any, SimpleNamespace(gt=None)), est, box) == {}
     rate = Rate(metrics.SUCCESS, Metric("depth", "depth error", "m"), limit=0.5)
     cells = {"depth": np.array([0.25, 0.5, 2.0, 0.1]), "method": np.array(["mine"] * 4)}
-    assert rate.of(Group(cells, cells)) == 0.5
+    assert rate.share(Group(cells, cells)) == 0.5
 
 
 # Scan2CAD -----------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def table() -> tuple[FloatArray, Symmetries]:
 
 
 def errors(group: Symmetry, est: Alignment, gt: Alignment) -> tuple[float, float]:
-    truth = group.nearest_turned(gt, est.rotation)
+    truth = group.nearest_pose(gt, est.rotation)
     return rotation_error(est=est, gt=truth), translation_error(est=est, gt=truth)
 
 

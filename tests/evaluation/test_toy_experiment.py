@@ -98,7 +98,9 @@ def plan(options: MiddleOptions, folder: RunFolder) -> Plan[tuple[str, int]]:
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     traces = [
-        Trace.of(index, line.method, [some.config["draws"]], [line.values[ERROR.key]], ERROR)
+        Trace.from_values(
+            index, line.method, [some.config["draws"]], [line.values[ERROR.key]], ERROR
+        )
         for index, some in enumerate(runs)
         for line in summarize(some, medians(ERROR))
     ]

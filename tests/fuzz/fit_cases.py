@@ -100,7 +100,7 @@ def _exact_focal(rng: np.random.Generator) -> Case:
     points = _cloud(rng, 7, 20)
     pose = draw_pose(rng)
     camera = (
-        Camera.without_focal(640, 480)
+        Camera.drop_focal(640, 480)
         if rng.random() < 0.5
         else Camera(640, 480, 90, 90, 319.5, 239.5)
     )

@@ -34,7 +34,7 @@ def image_centroid(weight: np.ndarray) -> np.ndarray:
 def test_a_resized_camera_renders_at_the_rescaled_pixels(factor: float) -> None:
     pixel = np.array([80.0, 60.0])
     center = 3.0 * np.append(CAMERA.normalize([pixel])[0], 1.0)
-    resized = CAMERA.resized(round(160 * factor), round(120 * factor))
+    resized = CAMERA.resize(round(160 * factor), round(120 * factor))
     expected = rescaled_pixels(pixel, factor)
     np.testing.assert_allclose(resized.project(center[None])[0], expected, atol=1e-9)
     if factor > 1:  # a marker of few pixels covers them unevenly
@@ -44,7 +44,7 @@ def test_a_resized_camera_renders_at_the_rescaled_pixels(factor: float) -> None:
 @pytest.mark.parametrize("offset", [(10, 20), (-5, 3)])
 def test_a_cropped_camera_renders_the_part_of_the_image(offset: tuple[int, int]) -> None:
     center = 3.0 * np.append(CAMERA.normalize([[60.0, 50.0]])[0], 1.0)
-    part = CAMERA.cropped(*offset, 100, 80)
+    part = CAMERA.crop(*offset, 100, 80)
     expected = CAMERA.project(center[None])[0] - offset
     np.testing.assert_allclose(part.project(center[None])[0], expected, atol=1e-9)
     assert (part.width, part.height, part.distortion) == (100, 80, CAMERA.distortion)

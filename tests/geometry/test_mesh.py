@@ -53,7 +53,7 @@ def test_surface_points_move_with_the_stretch(seed: int) -> None:
     rng = np.random.default_rng(seed)
     scale, weights = rng.uniform(0.2, 3, 3), rng.dirichlet(np.ones(3), 5)
     face = rng.integers(0, 2, 5)
-    stretched = MESH.stretched(scale)
+    stretched = MESH.stretch(scale)
     np.testing.assert_allclose(
         stretched.surface_points(face, weights), MESH.surface_points(face, weights) * scale
     )

@@ -106,7 +106,7 @@ def test_the_motion_leads_to_the_canonical_alignment(fold, rotation, across, up)
     found = symmetry.canonical(alignment, held=(True, False, False))
     np.testing.assert_allclose(found.alignment.scale, alignment.scale)
     np.testing.assert_allclose(
-        found.alignment.apply(found.relabelled(CUBE)), alignment.apply(CUBE), atol=1e-9
+        found.alignment.apply(found.map_points(CUBE)), alignment.apply(CUBE), atol=1e-9
     )
 
 

@@ -61,7 +61,7 @@ def test_unproject_inverts_project(name: str, seed: int) -> None:
 def test_a_turned_frame_changes_no_pixel(name: str, seed: int) -> None:
     camera, points = LENSES[name], directions(seed)
     turn = rotation_from_vector(np.random.default_rng(seed).normal(size=3))
-    turned = camera.turned(turn)
+    turned = camera.rotate(turn)
     pixels = camera.project(points)
     np.testing.assert_allclose(turned.project(points @ turn.T), pixels, atol=1e-9)
     np.testing.assert_allclose(turned.unproject(pixels), camera.unproject(pixels) @ turn.T)
@@ -153,12 +153,12 @@ def test_files_of_wide_lenses_need_a_focal_length() -> None:
 
 def test_a_turned_frame_is_not_written() -> None:
     with pytest.raises(InputError, match="a camera with a turned frame cannot be written"):
-        LENSES["opencv"].turned(np.eye(3)).to_dict()
+        LENSES["opencv"].rotate(np.eye(3)).to_dict()
 
 
 def test_a_pinhole_is_not_turned() -> None:
     with pytest.raises(InputError, match="a perspective camera cannot be turned"):
-        Camera(640, 480, 500, 500, 320, 240).turned(np.eye(3))
+        Camera(640, 480, 500, 500, 320, 240).rotate(np.eye(3))
 
 
 @every_lens

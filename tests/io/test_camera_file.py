@@ -41,6 +41,7 @@ def test_all_forms_give_the_same_camera(tmp_path: Path, name: str, content: obje
     [
         ("K.txt", "500 0 319.5", "not a calibration matrix"),
         ("K.txt", "a b c", "not a calibration matrix"),
+        ("cameras.txt", "1 PINHOLE 640 480 935 935 320 240", "COLMAP's list of cameras, not one"),
         ("K.json", {"matrix": [1, 2]}, "matrix: shape .* expected"),
         ("K.json", MATRIX, "camera: expected an object, got list"),
         ("camera.txt", CAMERA.to_dict(), "not a calibration matrix"),

@@ -190,8 +190,8 @@ def test_single_precision_is_kept() -> None:
             "camera first",
         ),
         (
-            lambda p, x, c: fit(p, x, Camera.without_focal(640, 480)),
-            "camera: the focal length is unknown; give it: camera.with_focal(...)",
+            lambda p, x, c: fit(p, x, Camera.drop_focal(640, 480)),
+            "camera: the focal length is unknown; give it: camera.replace_focal(...)",
         ),
     ],
 )

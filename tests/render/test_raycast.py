@@ -93,7 +93,7 @@ def test_stretching_by_the_pose_equals_stretching_the_mesh():
     view = look_at(azimuth=30, elevation=20, distance=6, scale=scale)
     by_pose = cast_geometry(Scene(mesh), CAMERA, view)
     by_mesh = cast_geometry(
-        Scene(mesh.stretched(scale)),
+        Scene(mesh.stretch(scale)),
         CAMERA,
         Alignment(view.rotation, view.translation, [1, 1, 1]),
     )

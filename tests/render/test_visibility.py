@@ -9,7 +9,7 @@ import trimesh
 from cadalign import Alignment, Camera, Mesh
 from cadalign.errors import InputError
 from cadalign.render import Scene, cast_geometry, look_at, sample_view, visible_keypoints
-from cadalign.render.posed import within_lens_field
+from cadalign.render.posed_scene import within_lens_field
 
 CAMERA = Camera.from_fov(320, 240, fov_x=50)
 SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)

@@ -82,7 +82,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
 def test_a_folder_becomes_a_library(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     library = Library.open(case.folder / "chairs.cadalign")
     assert library.keys == tuple(("chair", f"c{number}") for number in range(8))
-    assert library.with_mesh == 7
+    assert library.mesh_count == 7
     assert library["chair", "c2"].mesh_path == case.models / "c2.obj"
     np.testing.assert_allclose(library["chair", "c2"].bounds[1], points_of(2)[:6].max(axis=0))
     np.testing.assert_allclose(library["chair", "c7"].bounds[1], points_of(7).max(axis=0))

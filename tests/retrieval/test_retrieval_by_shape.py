@@ -20,7 +20,7 @@ from cadalign.retrieval.by_shape import gaussians_of, shape_posterior
 from cadalign.shapes.examples import Example
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
-POSE = Alignment.from_packed(
+POSE = Alignment.from_vector(
     np.array([0.8, 0, 0.6, 0.36, -0.8, -0.48, 0.48, 0.6, -0.64, 0.02, -0.01, 2.4, 1, 1, 1])
 )
 
@@ -132,7 +132,7 @@ def test_result_does_not_depend_on_the_order_of_keypoints() -> None:
         seen(model)[order], model.ids[order], CAMERA, sigma=sigma[order], shape=SHAPE
     )
     assert [match.model_id for match in one] == [match.model_id for match in other]
-    np.testing.assert_allclose(one[0].alignment.packed, other[0].alignment.packed, atol=1e-6)
+    np.testing.assert_allclose(one[0].alignment.vector, other[0].alignment.vector, atol=1e-6)
 
 
 def test_stretched_box_is_close_to_the_estimated_one() -> None:

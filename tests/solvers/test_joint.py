@@ -22,7 +22,7 @@ from cadalign.solvers.joint.evidence import (
     Sightings,
     State,
     kept_rows,
-    packed,
+    pack,
     points_of,
     unpack_state,
 )
@@ -95,17 +95,17 @@ def evidence_of(
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
     system = joint_system(evidence, integrates=integrates)
     room = empty_joint_equations(system.evidence, system.layout)
-    assert evaluate(system, packed(state), room) < np.inf
+    assert evaluate(system, pack(state), room) < np.inf
     return room.gradient
 
 
 def cost_of(evidence: Evidence, state: State, *, integrates: bool = False) -> float:
-    return equations_at(evidence, packed(state), integrates=integrates)[0]
+    return equations_at(evidence, pack(state), integrates=integrates)[0]
 
 
 def move_state(evidence: Evidence, state: State, step: np.ndarray) -> State:
     system = joint_system(evidence, integrates=False)
-    row, room = packed(state), empty_joint_equations(system.evidence, system.layout)
+    row, room = pack(state), empty_joint_equations(system.evidence, system.layout)
     evaluate(system, row, room)
     there = row.copy()
     move(system, row, room, 0.0, step, there)
@@ -144,9 +144,9 @@ def test_a_direction_that_agrees_with_the_pose_adds_no_cost() -> None:
     state, up = state_of(0, 2), evidence.directions
     turns = [each[:9].reshape(3, 3) for each in (evidence.rig.cam_from_rig[1], state.poses[1])]
     agreeing = up._replace(camera=up.model @ (turns[0] @ turns[1]).T)
-    without = evidence.with_block(Directions(*(each[:0] for each in up)))
+    without = evidence.add_block(Directions(*(each[:0] for each in up)))
     expected = cost_of(without, state)
-    assert cost_of(evidence.with_block(agreeing), state) == pytest.approx(expected)
+    assert cost_of(evidence.add_block(agreeing), state) == pytest.approx(expected)
     assert cost_of(evidence, state) > expected * (1 + 1e-3)
 
 
@@ -211,10 +211,10 @@ def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
     """Change of the gradient due to the shifted prior means of displacements."""
     system = joint_system(evidence, integrates=True)
     room = empty_joint_equations(system.evidence, system.layout)
-    evaluate(system, packed(state), room)
+    evaluate(system, pack(state), room)
     shifted = room.rows[-4].copy()
     plain = empty_joint_equations(evidence, system.layout)
-    evaluate(joint_system(evidence, integrates=False), packed(state), plain)
+    evaluate(joint_system(evidence, integrates=False), pack(state), plain)
     return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
 
 
@@ -223,7 +223,7 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     evidence = evidence_of(5, spread=spread, poses=(0, 0), loss=LINEAR)
     each = spread * np.eye(3 * POINTS).reshape(-1, POINTS, 3)
     evidence = predict_evidence(evidence, state_of(5, 1))
-    evidence = evidence.with_block(kept_rows(evidence.offsets, np.arange(0)))
+    evidence = evidence.add_block(kept_rows(evidence.offsets, np.arange(0)))
     as_modes = evidence._replace(
         shape=Shape(
             evidence.shape.mean,

@@ -9,7 +9,7 @@ from support.sighted import sighted_evidence
 
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.equations import empty_joint_equations
-from cadalign.solvers.joint.evidence import Evidence, Offsets, Shape, State, packed, points_of
+from cadalign.solvers.joint.evidence import Evidence, Offsets, Shape, State, pack, points_of
 from cadalign.solvers.joint.search import search_joint, used_points
 from cadalign.solvers.joint.system import joint_system
 from cadalign.solvers.search import evaluate
@@ -65,7 +65,7 @@ def test_a_minimum_is_a_minimum_in_all_modes(evidence: Evidence, rank: int) -> N
     cost, information = information_of(evidence, state)
     system = joint_system(evidence, integrates=True)
     room = empty_joint_equations(system.evidence, system.layout)
-    evaluate(system, packed(state), room)
+    evaluate(system, pack(state), room)
     slope = np.linalg.solve(information, room.gradient)
     assert room.gradient @ slope < 1e-9 * max(cost, 1.0)
     volume = np.linalg.slogdet(information)[1] + 6 * np.log(mean_depth(evidence, state))
@@ -95,5 +95,5 @@ def test_covariances_equal_those_of_all_modes(evidence: Evidence, rank: int) -> 
 def test_points_of_sightings_and_offsets_are_used(evidence: Evidence) -> None:
     ends, along = np.array([[6, 0], [7, -1]]), np.eye(3)[:2]
     offsets = Offsets(ends, np.array([-1, 0]), along, np.ones(2), np.ones(2))
-    more = evidence.with_block(offsets)
+    more = evidence.add_block(offsets)
     assert used_points(more).tolist() == [True] * 8 + [False]

@@ -13,10 +13,10 @@ from cadalign.estimation.estimates import single_posterior
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 from cadalign.solvers.marginal.equations import (
     POSE,
-    Posed,
-    empty_posed_equations,
-    evaluate_posed,
-    posed_cost,
+    Marginal,
+    empty_marginal_equations,
+    evaluate_marginal,
+    marginal_cost,
 )
 from cadalign.solvers.marginal.problem import Mixture, Seen, mixture_at, shape_at, target_of
 from cadalign.solvers.marginal.search import search_view
@@ -49,7 +49,7 @@ def state_at(pose: FloatArray, keypoints: int) -> FloatArray:
     return np.append(pose, np.zeros(6 * keypoints))
 
 
-def stacked_cost(system: Posed, state: FloatArray) -> float:
+def stacked_cost(system: Marginal, state: FloatArray) -> float:
     """Cost of pose and shape computed with dense matrices."""
     (mean, covariance), seen = system.target, system.seen
     flat = state[POSE : POSE + mean.size]
@@ -80,12 +80,12 @@ def move_state(state: FloatArray, step: FloatArray, offset: FloatArray) -> Float
 @given(st.integers(0, 1000), st.booleans())
 def test_a_minimum_is_a_minimum_of_pose_and_shape(seed: int, integrates: bool) -> None:
     mixture, seen, pose = problem_of(seed)
-    system = Posed(target_of(mixture_at(mixture, seen), 0), seen, integrates)
+    system = Marginal(target_of(mixture_at(mixture, seen), 0), seen, integrates)
     state = state_at(pose, 7)
     cost, _, converged = refine(system, 100, state)
     assert converged
     assert cost == pytest.approx(stacked_cost(system, state), rel=1e-6)
-    assert cost == pytest.approx(posed_cost(system, state))
+    assert cost == pytest.approx(marginal_cost(system, state))
     rng = np.random.default_rng(seed)
     for _ in range(20):
         near = move_state(state, rng.normal(0, 1e-3, 6), rng.normal(0, 1e-3, 21))
@@ -96,20 +96,20 @@ def test_a_minimum_is_a_minimum_of_pose_and_shape(seed: int, integrates: bool) -
 def test_derivatives_of_the_determinant_equal_finite_differences(loss: int) -> None:
     mixture, seen, pose = problem_of(2, loss)
     seen.rays[0] += 0.02  # an outlier
-    system = Posed(target_of(mixture_at(mixture, seen), 0), seen, True)
+    system = Marginal(target_of(mixture_at(mixture, seen), 0), seen, True)
     state = state_at(pose, 7)
     force = np.random.default_rng(2).normal(0, 0.5, 21)
     state[POSE:] = np.concatenate([system.target.covariance @ force, force])
-    room = empty_posed_equations(system)
+    room = empty_marginal_equations(system)
 
     def log_determinant(step: FloatArray) -> float:
-        evaluate_posed(system, move_state(state, step[:6], step[6:]), room)
+        evaluate_marginal(system, move_state(state, step[:6], step[6:]), room)
         return float(room.sums[1])
 
     by_difference = [
         (log_determinant(step) - log_determinant(-step)) / 4e-5 for step in 1e-5 * np.eye(27)
     ]
-    evaluate_posed(system, state, room)
+    evaluate_marginal(system, state, room)
     derivatives = np.concatenate([room.pose_slope, room.slope])
     assert derivatives == pytest.approx(np.array(by_difference), rel=1e-5, abs=1e-6)
 
@@ -139,9 +139,13 @@ def test_a_given_start_is_used() -> None:
 def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
     mixture, seen, pose = problem_of(1)
     state = state_at(pose, 7)
-    refine(Posed(target_of(mixture_at(mixture, seen), 0), seen, False), 100, state)
+    refine(Marginal(target_of(mixture_at(mixture, seen), 0), seen, False), 100, state)
     found = single_posterior(mixture, 0, seen, state, 1.0)
-    (covariance,), of_points, of_seen = found.covariances, found.of_points, found.of_seen
+    (covariance,), of_points, of_seen = (
+        found.covariances,
+        found.points_covariance,
+        found.points_cam_covariance,
+    )
     points = shape_at(mixture, 0, seen, state)
     assert found.points[:KEYPOINTS] == pytest.approx(points[:KEYPOINTS])
     size = mixture.means[0].size
@@ -178,7 +182,7 @@ def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
 def test_points_behind_the_camera_have_no_cost() -> None:
     mixture, seen, pose = problem_of(0)
     behind = state_at(np.concatenate([pose[:9], -pose[9:]]), 7)
-    system = Posed(target_of(mixture_at(mixture, seen), 0), seen, True)
-    assert evaluate_posed(system, behind, empty_posed_equations(system)) == np.inf
-    assert posed_cost(system, behind) == np.inf
+    system = Marginal(target_of(mixture_at(mixture, seen), 0), seen, True)
+    assert evaluate_marginal(system, behind, empty_marginal_equations(system)) == np.inf
+    assert marginal_cost(system, behind) == np.inf
     assert refine(system, 10, behind)[0] == np.inf

@@ -56,13 +56,13 @@ def project(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 def test_kernel_equals_alignment_and_perspective(seed: int) -> None:
     alignment, points = pose_and_points(seed)
     rays = perspective(alignment.apply(points))
-    np.testing.assert_allclose(project(alignment.packed, points), rays, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(project(alignment.vector, points), rays, rtol=0, atol=1e-14)
 
 
 @given(seed=seeds)
 def test_ray_derivatives_equal_finite_differences(seed: int) -> None:
     alignment, points = pose_and_points(seed)
-    pose = alignment.packed
+    pose = alignment.vector
     numerical = [
         (
             project(move_pose_by(pose, k, STEP), points)
@@ -91,7 +91,7 @@ def test_pixel_derivatives_equal_finite_differences(seed: int, camera: Camera) -
         elif unknown < 9:
             stretch[unknown - 6] = step
         else:
-            lens = camera.with_focal(camera.fx * np.exp(step))
+            lens = camera.replace_focal(camera.fx * np.exp(step))
         changed = Alignment(
             Rotation.from_rotvec(turn).as_matrix() @ alignment.rotation,
             alignment.translation + shift,
@@ -118,7 +118,7 @@ def test_gradient_of_all_evidence_is_the_gradient_of_the_cost(
 ) -> None:
     alignment, points = pose_and_points(seed, 40)  # more than a block of points
     rng = np.random.default_rng(seed)
-    pose = alignment.packed
+    pose = alignment.vector
     count = len(points) if each else 1
     free = np.array([1.0, 1, 1, 1, 1, 1, 1, rng.integers(2)])
     objective = Objective(

@@ -12,7 +12,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.solvers.joint.evidence import Evidence, Focals, Shape, State
 from cadalign.solvers.joint.rows import BlockEquation, equations_of, plain_equation, write_equation
-from cadalign.solvers.joint.search import equations_at, packed, refine_joint
+from cadalign.solvers.joint.search import equations_at, pack, refine_joint
 from cadalign.solvers.linalg import cross, triple
 from cadalign.solvers.projection import turn, turn_back
 
@@ -83,7 +83,7 @@ def add_vanishing_point(evidence: Evidence) -> Evidence:
     x, y, z = POSE[:9].reshape(3, 3) @ UP
     rays = FOCAL * np.array([[x / z, y / z]])
     image, weight = np.zeros(1, dtype=np.int64), np.array([500.0])
-    return evidence.with_block(VanishingPoints(UP[None], rays, image, weight))
+    return evidence.add_block(VanishingPoints(UP[None], rays, image, weight))
 
 
 def state_at(turn_by: FloatArray, log_focal: float) -> State:
@@ -97,14 +97,14 @@ def state_at(turn_by: FloatArray, log_focal: float) -> State:
 def test_gradient_of_a_custom_block_equals_finite_differences() -> None:
     evidence, step = add_vanishing_point(evidence_of_one_view()), 1e-6
     place = np.array([0.02, -0.03, 0.01])
-    gradient = equations_at(evidence, packed(state_at(place, 0.2)))[1].gradient
+    gradient = equations_at(evidence, pack(state_at(place, 0.2)))[1].gradient
     turned = Rotation.from_rotvec(place)
     for axis, by in enumerate(np.eye(3) * step):
         ends = [(Rotation.from_rotvec(s * by) * turned).as_rotvec() for s in (-1, 1)]
-        before, after = (equations_at(evidence, packed(state_at(e, 0.2)))[0] for e in ends)
+        before, after = (equations_at(evidence, pack(state_at(e, 0.2)))[0] for e in ends)
         np.testing.assert_allclose(gradient[axis], (after - before) / (4 * step), rtol=1e-5)
     before, after = (
-        equations_at(evidence, packed(state_at(place, 0.2 + s * step)))[0] for s in (-1, 1)
+        equations_at(evidence, pack(state_at(place, 0.2 + s * step)))[0] for s in (-1, 1)
     )
     np.testing.assert_allclose(gradient[6], (after - before) / (4 * step), rtol=1e-5)
 

@@ -102,7 +102,7 @@ def make_case(
     )
     write_image(case.photo, frame.composite())
     case.camera.write_text(json.dumps(instance.camera.to_dict()))
-    ModelKeypoints.of_model(model).save(case.keypoints)
+    ModelKeypoints.from_model(model).save(case.keypoints)
     return case
 
 

@@ -60,7 +60,7 @@ class Contour(NamedTuple):
         """Geometric mean of the extents [px]."""
         return float(np.sqrt(np.prod(np.ptp(self.points, axis=0))))
 
-    def at(self, places: FloatArray) -> FloatArray:
+    def offset_points(self, places: FloatArray) -> FloatArray:
         return np.asarray(self.points + places[..., None] * self.normals)
 
     def neighbours(self, kept: BoolArray, lag: int = 1) -> BoolArray:
@@ -245,7 +245,7 @@ class Sight(NamedTuple):
     def covers(self, pixels: FloatArray) -> BoolArray:
         """True (...) where pixels (..., 2) show the object."""
         origin, directions, valid = self._rays(pixels)
-        covered = self.caster.covered(origin, directions)
+        covered = self.caster.hit_mask(origin, directions)
         covered &= valid
         return np.asarray(covered.reshape(pixels.shape[:-1]))
 
@@ -278,9 +278,9 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     inner, outer = steps[first[rows]], steps[first[rows] + 1]
     for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
         half = (inner + outer) / 2
-        inside = sight.covers(some.at(half))
+        inside = sight.covers(some.offset_points(half))
         inner, outer = np.where(inside, half, inner), np.where(inside, outer, half)
-    face, points = sight.hits(some.at(inner))
+    face, points = sight.hits(some.offset_points(inner))
     hit = face >= 0  # a ray beside the bisection's may slip through
     found[rows[~hit]] = False
     rows = rows[hit]
@@ -297,7 +297,7 @@ def _rim_intervals(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[I
 
     def exits(some: Contour, places: FloatArray) -> tuple[IntArray, BoolArray]:
         along = np.repeat(places[:, None], len(some.points), axis=1)
-        return _nearest_exits(sight.covers(some.at(along)), places)
+        return _nearest_exits(sight.covers(some.offset_points(along)), places)
 
     near = len(steps) // 2 - 1
     first, found = exits(contour, steps[near : near + 3])
@@ -325,7 +325,7 @@ def rim_normals(contour: Contour, rims: Rims) -> FloatArray:
     Motion along the rim does not change its distance from the contour. Without a neighbouring rim,
     the contour's normals.
     """
-    places = contour.at(rims.offset)
+    places = contour.offset_points(rims.offset)
     gaps = np.diff(places, axis=0)
     gaps[~contour.neighbours(rims.found)] = 0.0
     along = np.zeros_like(places)
@@ -362,7 +362,7 @@ def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims)
         return bias
     some, offsets = contour.select(rows), rims.offset[rows]
     inside, places = mask
-    corner, rendered = _render_band(sight, inside, some.at(offsets))
+    corner, rendered = _render_band(sight, inside, some.offset_points(offsets))
     own = crossings(smooth(rendered), some.points - corner, some.normals, offsets)
     bias[rows] = np.nan_to_num(offsets - (own - places[rows]))
     return np.where(np.abs(bias) < REACH, bias, 0.0)

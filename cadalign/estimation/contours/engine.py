@@ -40,7 +40,7 @@ from cadalign.geometry.rotations import angles_between, rotation_from_vector
 from cadalign.io.images import ByteImage
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import State
-from cadalign.solvers.joint.search import cost_of, reduced, score_state
+from cadalign.solvers.joint.search import cost_of, reduce_evidence, score_state
 
 _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 12  # where only masks determine the estimate
@@ -180,7 +180,7 @@ def sources_of(views: Sequence[View], minimum: Minimum, *, is_exact: bool) -> li
     found: list[Source] = []
     for image, (view, camera) in enumerate(zip(views, minimum.lenses.cameras, strict=True)):
         if view.mask_image is not None:
-            found.append(MaskSource.of(image, view, camera, is_exact=is_exact))
+            found.append(MaskSource.from_view(image, view, camera, is_exact=is_exact))
         elif view.image is not None:
             photo = photo_of(camera, cast(ByteImage, view.image))
             found.append(PhotoSource(image, view.number, camera, is_exact, photo))
@@ -189,7 +189,7 @@ def sources_of(views: Sequence[View], minimum: Minimum, *, is_exact: bool) -> li
 
 def _is_determined(minimum: Minimum) -> bool:
     """True if the evidence without outlines determines all unknowns."""
-    _, information = information_of(*reduced(minimum.evidence, minimum.state))
+    _, information = information_of(*reduce_evidence(minimum.evidence, minimum.state))
     if not np.isfinite(information.diagonal()).all() or not (information.diagonal() > 0).all():
         return False
     return bool(np.linalg.eigvalsh(scaled_information(information)[0])[0] > _LEAST_INFORMATION)
@@ -197,7 +197,7 @@ def _is_determined(minimum: Minimum) -> bool:
 
 def _neighbouring_starts(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]:
     """States beside an estimate, along its least determined directions if these are wide."""
-    _, information = information_of(*reduced(start.evidence, start.state))
+    _, information = information_of(*reduce_evidence(start.evidence, start.state))
     poses, rest = 6 * len(start.state.poses), len(start.state.log_focals) + 3
     count = poses + rest * is_exact
     matrix, sizes = scaled_information(information[:count, :count])

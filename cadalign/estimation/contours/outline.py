@@ -35,7 +35,7 @@ class RigidSurface:
         self.mesh = mesh
         self.caster = RayCaster(mesh)
 
-    def at(self, shape: Shape, state: State) -> PosedSurface:
+    def pose(self, shape: Shape, state: State) -> PosedSurface:
         """The mesh at a state."""
         return self
 
@@ -55,7 +55,7 @@ class WarpedSurface:
         used = np.unique(_hull_faces(mesh.vertices)) if is_hull else slice(None)
         self._warp = linear_warp(mesh.vertices[used], mesh.bounds, source)
 
-    def at(self, shape: Shape, state: State) -> PosedSurface:
+    def pose(self, shape: Shape, state: State) -> PosedSurface:
         """See `RigidSurface`."""
         points = points_of(shape, state) / np.exp(state.log_scales)
         vertices = self._warp.apply(points[self._rows], np.sort(points[-2:], axis=0))

@@ -200,7 +200,7 @@ class Silhouette(NamedTuple):
         """Square root of the area [px]."""
         return float(np.sqrt(self.inside.sum()) * self.cell)
 
-    def at(self, points: FloatArray) -> BoolArray:
+    def contains(self, points: FloatArray) -> BoolArray:
         """True (...) for pixels (..., 2) inside."""
         columns, rows = np.moveaxis(np.rint((points - self.corner) / self.cell), -1, 0)
         return np.asarray(map_coordinates(self.inside, [rows, columns], order=0))
@@ -222,7 +222,7 @@ def silhouette_of(sight: Sight, cells: int) -> Silhouette | None:
         return None
     contour = rough._replace(points=corner + cell * rough.points)
     rims = remove_steep(contour, find_rims(sight, contour, _RIM_REACH * cell))
-    on_rim = contour._replace(points=contour.at(rims.offset))
+    on_rim = contour._replace(points=contour.offset_points(rims.offset))
     across = rim_normals(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
     within = (on_rim.points > _BORDER) & (
         on_rim.points < [sight.camera.width - 3, sight.camera.height - 3]
@@ -320,7 +320,7 @@ def _side_colors(
 
 def _visible_pixels(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
     """True for pixels (S, 2 K + 1, 2) until a line leaves the image or re-enters the object."""
-    kept = silhouette.at(pixels) == (np.arange(2 * STEPS + 1) < STEPS)
+    kept = silhouette.contains(pixels) == (np.arange(2 * STEPS + 1) < STEPS)
     kept &= photo.camera.contains(pixels, margin=PIXEL_CENTRE)
     kept[:, STEPS - 1 : STEPS + 2] = True  # cells are coarser than the rim
     for half in (kept[:, STEPS::-1], kept[:, STEPS:]):

@@ -77,7 +77,7 @@ class OutlineProblem(NamedTuple):
         for source, own in zip(self.sources, self.own_of(state), strict=True):
             camera, ratio = source.camera, ratios[source.image]
             if ratio != 1.0:
-                camera = camera.with_focal(camera.fx * ratio)
+                camera = camera.replace_focal(camera.fx * ratio)
             right, down = (REGISTRATION * own[1:]).tolist()
             camera = replace(camera, cx=camera.cx + right, cy=camera.cy + down)
             found.append(Sight(posed.caster, camera, poses[source.image]))
@@ -123,7 +123,7 @@ class OutlineProblem(NamedTuple):
         given = self.evidence
         sightings, offsets = given.sightings, given.offsets
         whole = given._replace(sightings=sightings._replace(point=moved(sightings.point)))
-        return whole.with_block(offsets._replace(ends=moved(offsets.ends)))
+        return whole.add_block(offsets._replace(ends=moved(offsets.ends)))
 
     def _rows_of(
         self, number: int, outline: Outline, noise: Noise, surface: PosedSurface, sight: Sight
@@ -241,7 +241,7 @@ def _run_rounds(
     """Run rounds until, at the last level, noise and objective converge; at most ``rounds``."""
     fit: OutlineFit | None = None
     for _ in range(rounds):
-        posed = problem.surface.at(problem.evidence.shape, state)
+        posed = problem.surface.pose(problem.evidence.shape, state)
         sights, offsets = problem.sights(state, posed), problem.offsets(state, tracks)
         outlines = [
             source.outline(sight, track)

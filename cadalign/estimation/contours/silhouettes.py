@@ -27,7 +27,7 @@ from cadalign.estimation.contours.outline import rigid_surface
 from cadalign.estimation.model import Model
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.geometry.alignment import Alignment, bounds_corners, model_rays
-from cadalign.geometry.camera import Camera, turned_alignment
+from cadalign.geometry.camera import Camera, rotate_alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.geometry.rotations import angles_between
@@ -97,7 +97,7 @@ def starts_of_mask(problem: Problem) -> list[Inits]:
         count=_MOST_SIMILAR,
         symmetry=model.symmetry,
     )
-    return [[turned_alignment(pose, problem.turns[0])] for pose, _ in poses]
+    return [[rotate_alignment(pose, problem.turns[0])] for pose, _ in poses]
 
 
 def similar_poses(
@@ -113,14 +113,14 @@ def similar_poses(
 
     Each has its overlap (intersection over union); ``free`` (3,) marks the unknown scales.
     """
-    view = CentredMask.of(mask, camera)
+    view = CentredMask.from_mask(mask, camera)
     atlas = atlas_of(mesh, _eye_of(mesh, view.outline))
     poses = _poses_of(*_affine_cameras(atlas, view.outline), atlas, free)
     found = [(pose, view.overlap(atlas.caster, pose)) for pose in poses]
     found.sort(key=lambda each: -each[1])
     kept = select_distinct(found, count, symmetry)
     turn = view.camera_from_facing
-    return [(turned_alignment(pose, turn), overlap) for pose, overlap in kept]
+    return [(rotate_alignment(pose, turn), overlap) for pose, overlap in kept]
 
 
 @lru_cache(maxsize=32)
@@ -140,7 +140,7 @@ def atlas_of(mesh: Mesh, eye: float) -> Atlas:
         columns, rows = np.minimum((high - low) // cell + 2, _CELLS + 1).astype(int)
         x, y = low[:, None] + cell * np.arange(_CELLS + 1)
         grid = np.stack(np.meshgrid(x[:columns], y[:rows]), axis=-1).reshape(-1, 2)
-        covered = caster.covered(middle - far * direction, (grid / far) @ base + direction)
+        covered = caster.hit_mask(middle - far * direction, (grid / far) @ base + direction)
         if covered.sum() >= _LEAST_CELLS:
             image = covered.reshape(rows, columns).astype(np.float32)
             views.append(_whiten(image, low + base @ middle, cell))
@@ -195,7 +195,7 @@ class CentredMask(NamedTuple):
     camera_from_facing: FloatArray
 
     @classmethod
-    def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> CentredMask:
+    def from_mask(cls, mask: FloatArray | BoolArray, camera: Camera) -> CentredMask:
         inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
         pixels = np.argwhere(inside)[:, ::-1].astype(float)
         found, valid = camera.rays_where_valid(pixels[:: max(1, len(pixels) // 20_000)])
@@ -227,7 +227,7 @@ class CentredMask(NamedTuple):
     def overlap(self, caster: RayCaster, pose: Alignment) -> float:
         """Intersection over union of the mask and the silhouette at a pose in this view."""
         origin, model_from_ray = model_rays(pose)
-        seen = caster.covered(origin, self.rays @ model_from_ray.T) & self.is_seen
+        seen = caster.hit_mask(origin, self.rays @ model_from_ray.T) & self.is_seen
         common = float(self.inside[seen].sum())
         return common / (float(self.inside.sum()) + int(seen.sum()) - common)
 

@@ -85,7 +85,9 @@ class MaskSource(OutlineSource):
     hint: str
 
     @classmethod
-    def of(cls, image: int, view: View, camera: Camera, *, is_exact: bool = True) -> MaskSource:
+    def from_view(
+        cls, image: int, view: View, camera: Camera, *, is_exact: bool = True
+    ) -> MaskSource:
         """The contour of a view's mask where the lens is valid; raises InputError without one."""
         mask = cast("FloatArray | BoolArray", view.mask_image)
         contour = mask_contour(mask, f"views[{view.number}].mask")

@@ -29,7 +29,7 @@ from cadalign.estimation.uncertainty.residuals import (
     loss_weights,
     whitening_matrices,
 )
-from cadalign.geometry.camera import faced, needs_facing, turned_alignment, turned_covariance
+from cadalign.geometry.camera import face_pixels, needs_facing, rotate_alignment, rotate_covariance
 from cadalign.geometry.rotations import by_rotation
 from cadalign.io.focal import FocalPrior
 from cadalign.solvers.draws import CentredAlignment, LogPriors, WhitenedPixels, weigh_draws
@@ -55,15 +55,15 @@ def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
         return None
     if needs_facing([fitted.camera]):
         kept = fitted.alignment.apply(fitted.points_3d[fitted.inliers])
-        camera = faced(fitted.camera, fitted.camera.project(kept))
+        camera = face_pixels(fitted.camera, fitted.camera.project(kept))
         turn = camera.lens_from_camera
         own = replace(
             fitted,
             camera=camera,
-            alignment=turned_alignment(fitted.alignment, turn.T),
-            fisher_covariance=turned_covariance(fitted.fisher_covariance, turn.T),
+            alignment=rotate_alignment(fitted.alignment, turn.T),
+            fisher_covariance=rotate_covariance(fitted.fisher_covariance, turn.T),
         )
-        covariance = turned_covariance(_posterior_covariance(own), turn)
+        covariance = rotate_covariance(_posterior_covariance(own), turn)
     else:
         covariance = _posterior_covariance(fitted)
     if fitted.symmetry is None:
@@ -128,7 +128,7 @@ class Chart(NamedTuple):
     priors: LogPriors
 
     @classmethod
-    def of(cls, fitted: FittedKeypoints, widening: float) -> Chart:
+    def from_fit(cls, fitted: FittedKeypoints, widening: float) -> Chart:
         """The chart of a fit with ``widening`` times its variance; a loss enters by its weights."""
         camera, options, alignment = fitted.camera, fitted.options, fitted.alignment
         kept, points = fitted.inliers, fitted.points_3d[fitted.inliers]
@@ -187,7 +187,7 @@ def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> Floa
     It is the inverse Fisher information, widened to the posterior and to the region that the
     likelihood ratio test does not reject at 5 %, so that its ellipsoid has the stated coverage.
     """
-    chart, free = Chart.of(fitted, widening), fitted.options.estimated_unknowns
+    chart, free = Chart.from_fit(fitted, widening), fitted.options.estimated_unknowns
     scales = np.flatnonzero((free >= 6) & (free < 9))
     # Sorted by variance, so that the draws do not depend on the order of the axes.
     free[scales] = free[scales][np.argsort(first.diagonal()[free[scales]], kind="stable")]

@@ -175,7 +175,7 @@ class ImageProblems(Setting):
         truth = make_problem(seen, task.outliers, rng=rng)
         ransac = replace(_SEARCH, seed=int(rng.integers(2**31)))
         facts = {"points": len(seen), "success": False}
-        return Case(task.names, facts, MethodInput.of_problem(truth, 1.0, ransac=ransac))
+        return Case(task.names, facts, MethodInput.from_problem(truth, 1.0, ransac=ransac))
 
     def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
         return errors_of(estimate, given)
@@ -284,7 +284,9 @@ def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[Corresponden
     images = _images_of(options.path)
     tasks = correspondence_tasks(images, options)
     more = {"loader": type(images).__name__, "correspondences": _fingerprint(Path(images.root))}
-    benchmark = Benchmark.of(ImageProblems(options), options.methods, metrics=options.metrics)
+    benchmark = Benchmark.from_methods(
+        ImageProblems(options), options.methods, metrics=options.metrics
+    )
     return benchmark.plan(options, tasks, chunk=_CHUNK, **more)
 
 

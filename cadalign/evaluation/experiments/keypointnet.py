@@ -1,4 +1,4 @@
-"""Experiment on views of KeypointNet's annotated models, and the demonstration."""
+"""Experiment on views of KeypointNet's annotated models."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -35,7 +34,7 @@ from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_of
 from cadalign.evaluation.methods import LIMIT, Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import INSTANCE_METRICS
 from cadalign.evaluation.metrics.errors import estimate_errors
-from cadalign.evaluation.options import ExperimentOptions, ViewOptions
+from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Row, fingerprint_of_files
@@ -111,7 +110,7 @@ class KeypointTasks(Sequence[KeypointTask]):
         if not self.keys:
             raise DataError("there are no models to evaluate", where=str(dataset.root))
         self._first = lru_cache(maxsize=4)(
-            lambda key: KeypointTask.of_model(dataset, *key, hull=options.visibility == "hull")
+            lambda key: KeypointTask.from_model(dataset, *key, hull=options.visibility == "hull")
         )
 
     def __len__(self) -> int:
@@ -150,7 +149,7 @@ class KeypointViews(Setting):
             replace(self.failed_case(task), error=instance)
             if isinstance(instance, Exception)
             else self._case(task, instance)
-            for task, instance in zip(tasks, self._instances(tasks), strict=True)
+            for task, instance in zip(tasks, self.instances(tasks), strict=True)
         ]
 
     def _case(self, task: KeypointTask, instance: Instance) -> Case:
@@ -167,7 +166,8 @@ class KeypointViews(Setting):
     def failed_case(self, task: KeypointTask) -> Case:
         return Case(task.names, {} if task.problem else {"symmetry": str(task.symmetry)})
 
-    def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
+    def instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
+        """The view of each task's model, or an error."""
         names = ("noise_px", "min_visible", "seed")
         how = {name: getattr(self.options, name) for name in names}
         plain = [task for task in tasks if not task.problem and task.model is None]
@@ -221,7 +221,7 @@ def keypointnet_benchmark(
 ) -> Benchmark:
     """The benchmark of the chosen methods on views of models."""
     setting = KeypointViews(options, drawn_in)
-    found = Benchmark.of(setting, options.methods, metrics=options.metrics)
+    found = Benchmark.from_methods(setting, options.methods, metrics=options.metrics)
     batched = frozenset(each.name for each in found.methods if not each.has_statistics)
     return replace(found, batched=batched)
 
@@ -292,66 +292,6 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     return benchmark.plan(options, tasks, chunk=chunk, annotations=tasks.fingerprint())
 
 
-# Demonstration ------------------------------------------------------------------------------------
-
-_LEAST_SAMPLE = 12  # models of each category of a sample dataset
-
-
-@dataclass(frozen=True)
-class DemoOptions(ExperimentOptions):
-    """Align stretched models to pictures of the originals and show the results.
-
-    For each model: draw a view, render it, stretch the model by random factors from 0.5 to 2 along
-    y and z, add 1 px of noise to its visible keypoints, fit, and draw the true (green) and the
-    estimated (red) box. Writes results.parquet and index.html.
-    """
-
-    experiment = "demo"
-    command = "demo"
-
-    root: Path | None = None
-    """Folder in KeypointNet's layout; a generated sample dataset by default."""
-    _: KW_ONLY
-    categories: tuple[str, ...] | None = None
-    """Categories to use; all by default."""
-    per_category: int = 6
-    """Maximum number of models per category."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_least(per_category=1)
-
-    @property
-    def default_workers(self) -> int:
-        """None: starting worker processes would take longer than the demonstration."""
-        return 0
-
-
-def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
-    """Plan one view of the first models with a mesh in every category."""
-    root = options.root
-    if root is None:
-        from cadalign.datasets import write_sample_dataset
-
-        folder.make()
-        least = max(options.per_category, _LEAST_SAMPLE)
-        root = write_sample_dataset(folder.path / "sample_dataset", per_category=least)
-    dataset = KeypointNet(root).subset(categories=options.categories, with_mesh=True)
-    if not dataset.ids():
-        raise DataError(
-            "none of the annotated models has a mesh",
-            where=str(dataset.root),
-            fix="put the meshes beside the annotations, or give the folder that holds both",
-        )
-    views = KeypointNetOptions(
-        root, methods=("optimal",), seed=options.seed, max_models=options.per_category
-    )
-    tasks = KeypointTasks(dataset, views)
-    benchmark = keypointnet_benchmark(views, folder.made_for_pictures())
-    more = {"methods": list(views.methods), "annotations": tasks.fingerprint()}
-    return benchmark.plan(replace(options, root=root), tasks, chunk=1, **more)
-
-
 SPEC = Spec(
     options=KeypointNetOptions,
     plan=plan,
@@ -382,4 +322,3 @@ SPEC = Spec(
         "of at most 5 %."
     ),
 )
-DEMO = replace(SPEC, options=DemoOptions, plan=plan_demo, plots=lambda runs: [])

@@ -45,7 +45,7 @@ from cadalign.evaluation.summary import (
     summarize,
 )
 from cadalign.geometry.alignment import Alignment, Box
-from cadalign.io.files import made_folder
+from cadalign.io.files import create_folder
 from cadalign.metrics import rotation_error
 
 if TYPE_CHECKING:
@@ -314,7 +314,7 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
         library = Library.from_models(dataset.subset(categories=options.categories))
     tasks = retrieval_tasks(library, options)
     name = library.fingerprint[:16]
-    file = made_folder(folder.path / "library") / f"{name}.cadalign"
+    file = create_folder(folder.path / "library") / f"{name}.cadalign"
     if not file.is_file():
         library.save(file)
     benchmark = retrieval_benchmark(str(file.absolute()), options)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 import tyro
 
 from cadalign.arrays import instance_rng
-from cadalign.errors import DataError, InputError, quote, unknown
+from cadalign.errors import DataError, InputError, quote, unknown_name
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods import Method, MethodInput, pose_of
@@ -97,12 +97,12 @@ class SweepOptions(FunctionOptions):
     values: tuple[float, ...] | None = None
     """Values of the varied quantity, instead of the default ones."""
     runs: int | None = None
-    """Number of problems per value."""
+    """Number of problems per value; by default 2000 for noise and points, 500 for outliers."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.sweep not in SWEEPS:
-            raise unknown("sweep", self.sweep, SWEEPS)
+            raise unknown_name("sweep", self.sweep, SWEEPS)
         if self.methods is not None:
             self.check_methods()
         if self.values is not None:
@@ -185,7 +185,7 @@ class SweepProblems(Setting):
 
     def case(self, task: SweepTask) -> Case:
         problem = self.problem(task)
-        return Case(task.names, instance=MethodInput.of_problem(problem, task.noise_px or 1.0))
+        return Case(task.names, instance=MethodInput.from_problem(problem, task.noise_px or 1.0))
 
     def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
         assert given.gt is not None
@@ -203,7 +203,7 @@ class SweepProblems(Setting):
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
     """The benchmark of a sweep, whose methods solve problems in batches."""
     setting, batched = SweepProblems(kind.name, seed), frozenset(kind.methods)
-    return Benchmark.of(setting, kind.methods, metrics=metrics, batched=batched)
+    return Benchmark.from_methods(setting, kind.methods, metrics=metrics, batched=batched)
 
 
 def sweep_of(run: Run) -> SweepKind:

@@ -29,7 +29,7 @@ from cadalign.evaluation.summary import (
     milliseconds,
     summarize,
 )
-from cadalign.io.files import made_folder
+from cadalign.io.files import create_folder
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
@@ -157,7 +157,7 @@ def learn(
         for model in models[category]
         for part in (category, model.model_id, model.keypoints.ids, model.keypoints.xyz)
     )
-    place = made_folder(folder.path / "learned" / fingerprint(*parts))
+    place = create_folder(folder.path / "learned" / fingerprint(*parts))
     for category in categories:
         file = place / f"{category}.shape"
         if not file.is_file():

@@ -209,7 +209,7 @@ class KeypointTask:
         return {"category": self.category, "model_id": self.model_id, "view": self.view}
 
     @classmethod
-    def of_model(
+    def from_model(
         cls, dataset: KeypointNet, category: str, model_id: str, *, hull: bool
     ) -> KeypointTask:
         """Make the task of a model's first view; ``hull`` ignores the mesh.

@@ -227,7 +227,7 @@ def photos_benchmark(options: PhotosOptions, drawn_in: RunFolder) -> Benchmark:
         if not is_function(name)
     }
     setting = PhotoObjects(options, drawn_in)
-    return Benchmark.of(setting, options.methods, own, metrics=options.metrics)
+    return Benchmark.from_methods(setting, options.methods, own, metrics=options.metrics)
 
 
 def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:

@@ -98,7 +98,7 @@ def shrink_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
     size = tuple(max(1, round(factor * length)) for length in (camera.width, camera.height))
     if photo.shape[1::-1] != size:
         photo = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    return photo, camera.resized(*size)
+    return photo, camera.resize(*size)
 
 
 def crop_photo(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteImage, Camera]:

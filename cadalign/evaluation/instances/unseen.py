@@ -124,7 +124,7 @@ class ShapeEstimate:
     result: Result | None = None  # None for methods without covariances
 
     @classmethod
-    def of(cls, result: Result) -> ShapeEstimate:
+    def from_result(cls, result: Result) -> ShapeEstimate:
         """Make the estimate of a result, whose keypoints have semantic ids."""
         ids = np.array(result.ids, dtype=np.int64)
         return cls(result.alignment, result.bounds, ids, result.points_3d, result)
@@ -143,14 +143,14 @@ def solve_object(seen: UnseenObject, *, method: str) -> ShapeEstimate:
         mean, stretch = seen.shape.mean, "none" if method == "mean-rigid" else None
         ids, bounds = seen.shape.ids, mean[-2:]
         model = Model(points_3d=mean[:-2], ids=ids, bounds=bounds, stretch=stretch)
-    return ShapeEstimate.of(align(model, seen.view_of(model)))
+    return ShapeEstimate.from_result(align(model, seen.view_of(model)))
 
 
 def unseen_benchmark(learned: Path, options: UnseenOptions) -> Benchmark:
     """The benchmark of the chosen methods on unseen objects."""
     own = {name: Method(name, partial(solve_object, method=name)) for name in METHODS}
     setting = UnseenObjects(learned, options)
-    return Benchmark.of(setting, options.methods, own, metrics=options.metrics)
+    return Benchmark.from_methods(setting, options.methods, own, metrics=options.metrics)
 
 
 # Errors -------------------------------------------------------------------------------------------
@@ -189,13 +189,13 @@ class UnseenObjects(Setting):
     ) -> ShapeEstimate:
         shape = seen.shape
         if isinstance(answer, Result) and tuple(answer.ids) == tuple(shape.ids):
-            return ShapeEstimate.of(answer)
+            return ShapeEstimate.from_result(answer)
         found = answer if isinstance(answer, Alignment) else answer.alignment
         ids = np.array(shape.ids, dtype=np.int64)
         return ShapeEstimate(found, shape.mean[-2:], ids, shape.mean[:-2])
 
     def row(self, method: Method, seen: UnseenObject, estimate: ShapeEstimate) -> Row:
-        return _errors(estimate, seen)
+        return object_errors(estimate, seen)
 
     def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str:
         """The record has the box of the object's keypoints."""
@@ -212,7 +212,8 @@ class UnseenObjects(Setting):
         )
 
 
-def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
+def object_errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
+    """Errors of an estimate, and the levels of its regions that hold the truth."""
     est, gt = found.alignment, seen.gt
     known, rows = _shared(found, seen)
     own = found.points_3d[rows]

@@ -78,7 +78,7 @@ def estimate_errors(
     """
     if not estimates:
         return []
-    est, gt = Alignments.of(estimates), Alignments.of([each.gt for each in instances])
+    est, gt = Alignments.stack(estimates), Alignments.stack([each.gt for each in instances])
     bounds = np.array([each.bounds for each in instances])
     diagonals = np.array([each.diagonal for each in instances])
     plain = _pose_errors(est, gt, bounds, diagonals)
@@ -95,10 +95,10 @@ def estimate_errors(
     turned = [k for k, symmetry in enumerate(symmetries) if not symmetry.is_trivial]
     if turned:
         nearest = [
-            symmetries[k].nearest_turned(instances[k].gt, estimates[k].rotation) for k in turned
+            symmetries[k].nearest_pose(instances[k].gt, estimates[k].rotation) for k in turned
         ]
         some = Alignments(*(array[turned] for array in est))
-        aware = _pose_errors(some, Alignments.of(nearest), bounds[turned], diagonals[turned])
+        aware = _pose_errors(some, Alignments.stack(nearest), bounds[turned], diagonals[turned])
         for name, values in aware.items():
             columns[f"sym_{name}"][turned] = values
     cells = {name: values.tolist() for name, values in columns.items()}

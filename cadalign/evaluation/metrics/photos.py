@@ -48,7 +48,7 @@ class Rate:
     limit: float | None = None
     """Values below the limit count; without a limit, values above 0."""
 
-    def of(self, group: Group) -> float:
+    def share(self, group: Group) -> float:
         """The share in a group; failures count as misses."""
         values = drop_nan(group.solved[self.column.key])
         count = len(values) + len(group.rows["method"]) - len(group.solved["method"])
@@ -78,7 +78,9 @@ def statistics_of(cells: Cells) -> Statistics:
 
     Shares are left out if their column is empty in ``cells``.
     """
-    shares = {rate.metric.key: rate.of for rate in RATES if len(drop_nan(cells[rate.column.key]))}
+    shares = {
+        rate.metric.key: rate.share for rate in RATES if len(drop_nan(cells[rate.column.key]))
+    }
     return {**medians(*MEDIANS), **shares}
 
 

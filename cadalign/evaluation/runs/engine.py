@@ -29,7 +29,7 @@ from cadalign.evaluation.runs.executors import dask_cluster, process_pool, threa
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import SECONDS, read_cells, write_rows, write_tables
 from cadalign.evaluation.runs.work import AbortError, Columns, Experiment, Plan, Row, reason_of
-from cadalign.io.files import made_folder
+from cadalign.io.files import create_folder
 
 T = TypeVar("T")
 Chunk = tuple[int, Sequence[Any]]
@@ -95,7 +95,7 @@ def execute(
     """Run a plan or continue it; ``on_progress`` is called after every chunk."""
     folder.make()
     experiment, total = plan.experiment, len(plan.tasks)
-    with folder.locked():
+    with folder.lock():
         folder.claim({**plan.config, "tasks": total, "chunk_size": plan.chunk_size})
         _sweep(folder.path)
         if not folder.is_finished:
@@ -113,7 +113,7 @@ def execute(
 
 
 def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: OnProgress) -> None:
-    _sweep(made_folder(folder.parts))
+    _sweep(create_folder(folder.parts))
     experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
     own = [each for each in experiment.record_columns if each not in experiment.columns]
     columns: Columns = (*experiment.columns, *SECONDS, *own)

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 from msgspec import Meta, field
 
 from cadalign.errors import DataError
-from cadalign.io.documents import Count, ForeignDocument, convert, in_file, read_json
-from cadalign.io.files import locked, made_folder, refuse_nul, write_json
+from cadalign.io.documents import Count, ForeignDocument, convert, name_file, read_json
+from cadalign.io.files import create_folder, hold_lock, refuse_nul, write_json
 
 _FORMAT = 1
 _LONGEST_VALUE = 80
@@ -71,20 +71,20 @@ class RunFolder:
 
     def make(self) -> None:
         """Create the folder."""
-        made_folder(self.path)
+        create_folder(self.path)
 
     def made_for_pictures(self) -> RunFolder:
         """Create the folder and its folders for pictures; returns it with its absolute path."""
         self.make()
         for path in (self.thumbs, self.pictures, self.previews):
-            made_folder(path)
+            create_folder(path)
         return RunFolder(self.path.absolute())
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Lock the run against other processes; the lock of a killed process is released."""
         what = "another process is working on this run"
-        with locked(self.path / _LOCK, what, fix="wait for it, or give another folder (--out)"):
+        with hold_lock(self.path / _LOCK, what, fix="wait for it, or give another folder (--out)"):
             yield
 
     def read_config(self) -> dict[str, Any] | None:
@@ -94,7 +94,7 @@ class RunFolder:
         if not path.exists():
             return None
         found: dict[str, Any] = read_json(path)
-        with in_file(path):
+        with name_file(path):
             convert(found, _Config)
         return found
 

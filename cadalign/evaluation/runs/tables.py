@@ -21,7 +21,7 @@ from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import name_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import COLUMNS, Columns, Row
-from cadalign.io.documents import convert, in_file
+from cadalign.io.documents import convert, name_file
 from cadalign.io.files import write_whole
 
 DONE_ANEW = "remove it and start the same run again: it is computed again"
@@ -191,7 +191,7 @@ class Run:
     @cached_property
     def metrics(self) -> tuple[Metric, ...]:
         """Metrics of users' functions, from the run's configuration."""
-        with in_file(self.folder.config_file):
+        with name_file(self.folder.config_file):
             functions = convert(self.config.get("metrics") or (), tuple[str, ...], "metrics")
         return tuple(metric_named(name_of(each)) for each in functions)
 

@@ -13,13 +13,13 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DataError, brief
 from cadalign.geometry.mesh import Mesh, check_near, face_normals, spread_colors
-from cadalign.io.documents import in_file
+from cadalign.io.documents import name_file
 from cadalign.io.files import (
     as_path,
-    damaged,
-    keep,
-    made_folder,
+    create_folder,
+    damage_error,
     once_per_file,
+    protect_input,
     read_bytes,
     write_whole,
 )
@@ -88,12 +88,12 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             where=str(path),
             fix=f"known are {', '.join(_READERS)}",
         )
-    keep(path)
+    protect_input(path)
     try:
         data = read_bytes(path)
         if not data:
             raise DataError("the mesh file is empty", where=str(path), fix="get it again")
-        with in_file(path), np.errstate(all="ignore"):  # Mesh refuses values that are not finite
+        with name_file(path), np.errstate(all="ignore"):  # Mesh refuses values that are not finite
             mesh = reader(data.removeprefix(BOM_UTF8), path)
             if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
                 raise DataError("all faces of the mesh have zero area")
@@ -103,7 +103,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             raise
         reason = f"{type(error).__name__}: {brief(error)}"
         kind = path.suffix[1:].upper()
-        raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
+        raise damage_error(f"cannot be read as a {kind} file ({reason})", path) from None
     return mesh
 
 
@@ -167,7 +167,7 @@ def write_mesh(path: Path, mesh: Mesh, *, kind: Literal["obj", "ply"]) -> None:
     options: dict[str, Any] = {"digits": _DIGITS, "header": None} if kind == "obj" else {}
     data: Any = written.export(file_type=kind, **options)
     content = data.encode() if isinstance(data, str) else data
-    made_folder(path.parent)
+    create_folder(path.parent)
     write_whole(path, lambda unfinished: unfinished.write_bytes(content))
 
 

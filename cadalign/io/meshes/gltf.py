@@ -24,7 +24,7 @@ from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import parse_json
-from cadalign.io.files import damaged, read_bytes, reading, require_count
+from cadalign.io.files import damage_error, guard_reading, read_bytes, require_count
 from cadalign.io.meshes.materials import WHITE, Texture, Textures, find_reference, vertex_colors
 
 _Part = dict[str, Any]
@@ -49,7 +49,7 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     two bytes of its buffers.
     """
     text, binary = _split_chunks(data, path) if data[:4] == b"glTF" else (data, b"")
-    with reading(path):
+    with guard_reading(path):
         document = parse_json(str(text, "utf-8-sig"), str(path))
     _check(document)
     file = _GltfFile(path, document, binary)
@@ -97,7 +97,7 @@ class _GltfFile:
         start, length = part.get("byteOffset", 0), part["byteLength"]
         if len(data) < announced or not 0 <= start <= start + length <= len(data):
             what = f"{len(data)} bytes in its buffer, {max(announced, start + length)} announced"
-            raise damaged(what, f"bufferViews[{number}]")
+            raise damage_error(what, f"bufferViews[{number}]")
         return memoryview(data)[start : start + length]
 
     def _array(self, number: int) -> npt.NDArray[Any]:
@@ -113,7 +113,7 @@ class _GltfFile:
         needed = offset + (count - 1) * stride + row
         if min(count - 1, offset, stride - row) < 0 or needed > len(data):
             what = f"{count} values of {row} bytes do not fit into {len(data)} bytes"
-            raise damaged(what, f"accessors[{number}]")
+            raise damage_error(what, f"accessors[{number}]")
         strides = (stride, dtype.itemsize)
         values = np.ndarray((count, width), dtype, buffer=data, offset=offset, strides=strides)
         if accessor.get("normalized") and dtype.kind != "f":
@@ -189,7 +189,7 @@ def _get_part(document: _Part, name: str, number: int) -> _Part:
     """Return a numbered part of one of the document's lists; raises DataError if missing."""
     parts = document.get(name, [])
     if not 0 <= number < len(parts):
-        raise damaged(f"does not exist; there are {len(parts)} {name}", f"{name}[{number}]")
+        raise damage_error(f"does not exist; there are {len(parts)} {name}", f"{name}[{number}]")
     found: _Part = parts[number]
     return found
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DataError, brief, quote
 from cadalign.geometry.mesh import GREY, Material
-from cadalign.io.files import keep, read_text
+from cadalign.io.files import protect_input, read_text
 from cadalign.io.images import open_photo, open_picture
 
 logger = logging.getLogger("cadalign")
@@ -46,7 +46,7 @@ def load_materials(
             given = obj_path, brief(library), error.what
             logger.warning("%s: the material library %s cannot be read (%s)", *given)
             continue
-        keep(path)
+        protect_input(path)
         entries |= {name: (path, entry) for name, entry in parsed.items()}
     found: dict[str, Material] = {}
     textures = Textures()
@@ -126,7 +126,7 @@ class Textures:
 
     def _pixels(self, picture: Path | bytes, within: Path) -> Texture:
         if isinstance(picture, Path):
-            keep(picture)
+            protect_input(picture)
             opened = open_photo(picture)
         else:
             opened = open_picture(io.BytesIO(picture), len(picture), where=str(within))

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from cadalign.arrays import parse_numbers
 from cadalign.errors import DataError, brief
 from cadalign.geometry.mesh import GREY, Material, Mesh
-from cadalign.io.files import damaged, require_count
+from cadalign.io.files import damage_error, require_count
 from cadalign.io.meshes.materials import WHITE, load_materials, vertex_colors
 
 _NO_COLOR = (np.nan, np.nan, np.nan)
@@ -66,15 +66,17 @@ def read_obj(data: bytes, path: Path) -> Mesh:
             elif key == b"mtllib":
                 libraries.append(_text(body))
             elif b"\0" in line:
-                raise damaged("holds binary data, not the text of an OBJ file", f"line {number}")
+                raise damage_error(
+                    "holds binary data, not the text of an OBJ file", f"line {number}"
+                )
         except (ValueError, IndexError):
             shown = line[:60].decode("ascii", errors="replace")
-            raise damaged(f"cannot read {shown!r}", f"line {number}") from None
+            raise damage_error(f"cannot read {shown!r}", f"line {number}") from None
     if not sizes:
         what = f"the file has {len(vertices)} vertices, but no faces"
         raise DataError(what, fix="is it a complete OBJ file?")
     if not vertices:
-        raise damaged(f"the file has {len(sizes)} faces, but no vertices")
+        raise damage_error(f"the file has {len(sizes)} faces, but no vertices")
     named = np.array(corners)
     indices = np.where(named < 0, np.repeat(before, sizes, axis=0) + named, named)
     counts = len(vertices), len(coordinates) - 1
@@ -84,7 +86,9 @@ def read_obj(data: bytes, path: Path) -> Mesh:
         corner, kind = wrong[0]
         face = np.repeat(np.arange(len(sizes)), sizes)[corner]
         what = f"{('vertex', 'texture coordinate')[kind]} {named[corner, kind]}"
-        raise damaged(f"face {face} (counted from 0) names {what}, but there are {counts[kind]}")
+        raise damage_error(
+            f"face {face} (counted from 0) names {what}, but there are {counts[kind]}"
+        )
     used, rows_of = np.unique(looks, return_inverse=True)
     names = np.array([*numbers], dtype=object)[used].tolist()
     known = load_materials(path, libraries, [name for name in names if name])
@@ -170,7 +174,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
         raise DataError("not a PLY file", fix="give a file that begins with 'ply'")
     end = _HEADER_END.search(data)
     if end is None:
-        raise damaged("the PLY header has no end")
+        raise damage_error("the PLY header has no end")
     form, elements = _header(data[: end.start()].decode("utf-8", errors="replace"))
     data, place = data[end.end() :], 0
     if form == "ascii":
@@ -262,13 +266,13 @@ def read_stl(data: bytes, path: Path) -> Mesh:
     if found:
         announced, end = len(_STL_FACET.findall(data)), data.lower().rfind(b"endsolid")
         if end < 0 or len(found) != 3 * announced:
-            raise damaged(f"the text ends before 'endsolid', after {len(found) // 3} faces")
+            raise damage_error(f"the text ends before 'endsolid', after {len(found) // 3} faces")
         surplus = len(data[end:].partition(b"\n")[2].strip())
         require_count("faces", announced, announced, surplus, path)
         corners = parse_numbers(b" ".join(found), 3 * len(found))
     else:
         if len(data) < _STL_HEADER:
-            raise damaged(f"{len(data)} bytes, but the header alone has {_STL_HEADER}")
+            raise damage_error(f"{len(data)} bytes, but the header alone has {_STL_HEADER}")
         announced = int.from_bytes(data[80:_STL_HEADER], "little")
         size = len(data) - _STL_HEADER
         surplus = size - announced * _STL_FACE.itemsize
@@ -291,7 +295,7 @@ def read_off(data: bytes, path: Path) -> Mesh:
         counts, rows = rows[1], rows[1:]
     vertices, faces = int(counts[0]), int(counts[1])
     if min(vertices, faces) < 1:
-        raise damaged(f"the header announces {vertices} vertices and {faces} faces")
+        raise damage_error(f"the header announces {vertices} vertices and {faces} faces")
     lines, last = rows[1:], vertices + faces
     require_count("vertices", vertices, len(lines), 0, path)
     surplus = sum(map(len, chain(*lines[last:])))
@@ -300,7 +304,7 @@ def read_off(data: bytes, path: Path) -> Mesh:
     for number, row in enumerate(polygons):
         if not row[0].isdigit() or len(row) <= int(row[0]):
             what = f"face {number} is {brief(b' '.join(row).decode('ascii', 'replace'))!r}"
-            raise damaged(f"{what}, after the announced {vertices} vertices")
+            raise damage_error(f"{what}, after the announced {vertices} vertices")
     sizes = np.array([int(row[0]) for row in polygons], dtype=np.int64)
     corners = b" ".join(b" ".join(row[1 : 1 + int(row[0])]) for row in polygons)
     coordinates = b" ".join(b" ".join(row[:3]) for row in points)

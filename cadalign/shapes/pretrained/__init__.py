@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from cadalign.errors import unknown
+from cadalign.errors import unknown_name
 
 logger = logging.getLogger("cadalign")
 
@@ -27,7 +27,7 @@ def shape_path(given: Path) -> Path:
     """
     if given.name not in CATEGORIES:
         if not given.suffix and not given.exists():
-            raise unknown("shape", given.name, CATEGORIES, where=str(given))
+            raise unknown_name("shape", given.name, CATEGORIES, where=str(given))
         return given
     if given.is_file():
         text = "%s: this file is used, not the shape of the category that comes with cadalign"

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import fast_sums, inlined, kernel
+from cadalign.compile import fast_sums, inline, kernel
 from cadalign.solvers.linalg import add_products, factorize, mirror_upper, solve_factor
 
 _LEAST_SHARE = 1e-12  # least information about an unknown given the others, relative to its own
@@ -36,7 +36,7 @@ def empty_arrow(poses: int, border: int) -> Arrow:
     )
 
 
-@inlined
+@inline
 def border_start(arrow: Arrow) -> int:
     return int(arrow.gradient.shape[0] - arrow.border.shape[0])
 
@@ -62,7 +62,7 @@ def dense_matrix(arrow: Arrow) -> FloatArray:
     return whole
 
 
-@inlined
+@inline
 def add_gradient(arrow: Arrow, pose: int, row: FloatArray) -> None:
     """Add derivatives (6 + b,) by one pose and the border to the gradient."""
     first, own = border_start(arrow), arrow.blocks.shape[1] * pose
@@ -91,7 +91,7 @@ def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: 
             arrow.border[k, m] += matrix[6 + k, 6 + m]
 
 
-@inlined
+@inline
 def fix_unknown(arrow: Arrow, k: int) -> None:
     """Fix unknown k of the border: replace its equation by a unit row."""
     arrow.gradient[border_start(arrow) + k] = 0.0

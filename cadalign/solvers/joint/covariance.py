@@ -12,7 +12,7 @@ from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.evidence import whole_information
 from cadalign.solvers.joint.arrow import Arrow, dense_matrix, invert_arrow
 from cadalign.solvers.joint.equations import JointEquations
-from cadalign.solvers.joint.evidence import Evidence, State, packed, points_of
+from cadalign.solvers.joint.evidence import Evidence, State, pack, points_of
 from cadalign.solvers.joint.search import equations_at, reduce_modes, sighted_points
 
 
@@ -39,7 +39,7 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
         evidence = evidence._replace(scales=evidence.scales._replace(bound=whole))
     reduction = reduce_modes(evidence)
     reduced, fewer = reduction.evidence, reduction.reduce_state(state)
-    _, equations = equations_at(reduced, packed(fewer))
+    _, equations = equations_at(reduced, pack(fewer))
     inverse = invert_arrow(equations.arrow)
     first, modes = len(evidence.focals.low) + 3, len(evidence.shape.modes)
     if inverse is None:
@@ -123,7 +123,7 @@ def _first_camera_frame(
 
 def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
     """Cost at a state, and information (U, U) about all unknowns, border last."""
-    cost, equations = equations_at(evidence, packed(state))
+    cost, equations = equations_at(evidence, pack(state))
     return cost, dense_matrix(equations.arrow)
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import borrowing, kernel
+from cadalign.compile import borrow, kernel
 from cadalign.solvers.joint.arrow import Arrow, add_gradient, border_start, empty_arrow
 from cadalign.solvers.joint.evidence import (
     Evidence,
@@ -131,7 +131,7 @@ def eliminate_displacements(
     return cost
 
 
-@borrowing
+@borrow
 def _whiten_columns(
     rows: FloatArray, start: int, end: int, spread: float, factor: FloatArray
 ) -> float:
@@ -158,7 +158,7 @@ def _whiten_columns(
     return log_determinant
 
 
-@borrowing
+@borrow
 def shift_means(spread: FloatArray, equations: JointEquations) -> None:
     """Move the prior means of displacements by the slopes of the log determinant."""
     rows, columns = equations.rows, equations.layout.columns
@@ -176,7 +176,7 @@ def shift_means(spread: FloatArray, equations: JointEquations) -> None:
                 equations.gradient[k if k < 6 else k + beyond_pose] += rows[k, c] * moved
 
 
-@borrowing
+@borrow
 def update_displacements(
     spread: FloatArray, equations: JointEquations, step: FloatArray, displacements: FloatArray
 ) -> None:
@@ -262,7 +262,7 @@ def _undetermined_shares(spread: FloatArray, rows: FloatArray, columns: IntArray
     return left
 
 
-@borrowing
+@borrow
 def _write_point_rows(
     evidence: Evidence,
     state: State,
@@ -289,7 +289,7 @@ def _write_point_rows(
             column += 1
 
 
-@borrowing
+@borrow
 def _add_slopes(
     evidence: Evidence,
     state: State,
@@ -345,7 +345,7 @@ def _add_slopes(
                     gradient[first + 3 + k] += slopes[i, c] * shape.modes[k, i, c]
 
 
-@borrowing
+@borrow
 def _write_responses(
     shape: Shape,
     i: int,

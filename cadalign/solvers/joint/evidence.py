@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.linalg import Triple
 
@@ -143,7 +143,7 @@ class Evidence(NamedTuple):
     def offsets(self) -> Offsets:
         return cast(Offsets, self.blocks[1])
 
-    def with_block(self, block: Any) -> Evidence:
+    def add_block(self, block: Any) -> Evidence:
         """Replace the block of the same type, or append a block of a new type."""
         kinds = [type(each) for each in self.blocks]
         if type(block) not in kinds:
@@ -192,7 +192,7 @@ def stack_tables(tables: Sequence[Table]) -> Table:
     return type(tables[0])(*map(np.concatenate, zip(*tables, strict=True)))
 
 
-def packed(state: State) -> FloatArray:
+def pack(state: State) -> FloatArray:
     return np.concatenate([np.ravel(part) for part in state])
 
 
@@ -236,12 +236,12 @@ def depths_along_axes(
     return np.asarray((seen * evidence.rig.axes[image]).sum(axis=1))
 
 
-@inlined
+@inline
 def exp_triple(logs: FloatArray) -> Triple:
     return np.exp(logs[0]), np.exp(logs[1]), np.exp(logs[2])
 
 
-@inlined
+@inline
 def stretched_point(shape: Shape, state: State, scale: Triple, i: int) -> Triple:
     return (
         scale[0] * coordinate_of(shape, state, i, 0),
@@ -250,7 +250,7 @@ def stretched_point(shape: Shape, state: State, scale: Triple, i: int) -> Triple
     )
 
 
-@inlined
+@inline
 def coordinate_of(shape: Shape, state: State, i: int, a: int) -> float:
     """Coordinate a of point i before the stretch."""
     value = shape.mean[i, a] + state.displacements[i, a]

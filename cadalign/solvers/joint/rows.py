@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import borrowing, inlined, kernel, kernel_family, unrolled
+from cadalign.compile import borrow, inline, kernel, kernel_family, unrolled
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.evidence import excess_of, loss_and_root, weigh_error, weight_slope
 from cadalign.solvers.joint.arrow import Arrow, add_rows, border_start
@@ -76,14 +76,14 @@ def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -
     return found
 
 
-@inlined
+@inline
 def plain_equation(pose: int, residual: float) -> BlockEquation:
     """An equation with squared loss."""
     return BlockEquation(pose, residual, residual * residual, 1.0, 0.0)
 
 
 @equations_of.of(Directions)
-@inlined
+@inline
 def _equations_of_directions(directions: Directions) -> int:
     return 3 * int(directions.image.shape[0])
 
@@ -107,7 +107,7 @@ def _write_direction(
 
 
 @equations_of.of(Offsets)
-@inlined
+@inline
 def _equations_of_offsets(offsets: Offsets) -> int:
     return int(offsets.value.shape[0])
 
@@ -148,7 +148,7 @@ def _write_offset(
     return plain_equation(p, value * weight)
 
 
-@inlined
+@inline
 def _add_shape(shape: Shape, state: State, i: int, a: int, slope: float, row: FloatArray) -> None:
     """Add derivatives by scale and coefficients of ``slope`` times coordinate a of point i."""
     modes = shape.modes.shape[0]
@@ -159,7 +159,7 @@ def _add_shape(shape: Shape, state: State, i: int, a: int, slope: float, row: Fl
         row[first + 3 + k] += scale * shape.modes[k, i, a]
 
 
-@borrowing
+@borrow
 def write_rows(
     evidence: Evidence,
     state: State,

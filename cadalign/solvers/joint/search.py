@@ -10,7 +10,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.solvers.constants import LEAST_POINTS, LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.joint.equations import JointEquations
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, pack
 from cadalign.solvers.joint.system import joint_system, run_joint
 from cadalign.solvers.optimal import optimal_batch, rigid_flag
 from cadalign.solvers.search import Effort
@@ -100,7 +100,7 @@ def objective_of(evidence: Evidence, state: State) -> float:
 
 def cost_of(evidence: Evidence, state: State) -> float:
     """Cost at a state, without the log determinant of integrated unknowns."""
-    return equations_at(evidence, packed(state))[0]
+    return equations_at(evidence, pack(state))[0]
 
 
 def score_state(evidence: Evidence, state: State) -> float:
@@ -228,7 +228,7 @@ def displaced_modes(shape: Shape, displaced: IntArray) -> FloatArray:
     return np.concatenate([shape.modes, own])
 
 
-def reduced(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+def reduce_evidence(evidence: Evidence, state: State) -> tuple[Evidence, State]:
     """Reduced evidence, and the reduced state."""
     reduction = reduce_modes(evidence)
     return reduction.evidence, reduction.reduce_state(state)
@@ -237,7 +237,7 @@ def reduced(evidence: Evidence, state: State) -> tuple[Evidence, State]:
 def pack_reduced(evidence: Evidence, state: State) -> tuple[Reduction, FloatArray]:
     """Reduction of evidence, and the packed reduced state."""
     reduction = reduce_modes(evidence)
-    return reduction, packed(reduction.reduce_state(state))
+    return reduction, pack(reduction.reduce_state(state))
 
 
 def used_points(evidence: Evidence) -> BoolArray:

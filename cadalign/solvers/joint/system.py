@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import inline, kernel
 from cadalign.solvers.evidence import score_of_distance, whole_information
 from cadalign.solvers.joint.arrow import (
     add_rows,
@@ -189,7 +189,7 @@ def _move(
         update_displacements(evidence.shape.spread, equations, step, moved.displacements)
 
 
-@inlined
+@inline
 def _follow_focals(evidence: Evidence, state: State, log_steps: FloatArray, moved: State) -> None:
     """Scale distances with focal lengths: the cost hardly changes along this direction."""
     for v in range(evidence.rig.pose.shape[0]):
@@ -200,7 +200,7 @@ def _follow_focals(evidence: Evidence, state: State, log_steps: FloatArray, move
             moved.poses[p, 11] = along * factor
 
 
-@inlined
+@inline
 def _bound_step(log_step: float) -> float:
     return min(max(log_step, -_LARGEST_LOG_STEP), _LARGEST_LOG_STEP)
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import borrowing, fast_sums, inlined, kernel
+from cadalign.compile import borrow, fast_sums, inline, kernel
 from cadalign.solvers.alignment import Equations, empty_equations, solve_damped
 from cadalign.solvers.constants import POSE_SIZE
 from cadalign.solvers.evidence import (
@@ -72,7 +72,7 @@ _SAME_CHORD = 0.05
 _LEAST_INFORMATION = 25.0  # added about rotations [1 / rad^2]: large angles are not Gaussian
 
 
-class Posed(NamedTuple):
+class Marginal(NamedTuple):
     """One view's keypoints under one Gaussian; without ``integrates`` the cost omits log det M.
 
     A state is the pose (12,), rotation row by row and translation; offsets x (3 n,) of the
@@ -84,7 +84,7 @@ class Posed(NamedTuple):
     integrates: bool
 
 
-class PosedEquations(NamedTuple):
+class MarginalEquations(NamedTuple):
     """Whitened equations of 2 n coordinates, and scratch space.
 
     ``normal`` are the normal equations of the pose, ``gradient`` is their gradient. ``rows``
@@ -112,11 +112,11 @@ class PosedEquations(NamedTuple):
 
 
 @kernel
-def empty_posed_equations(system: Posed) -> PosedEquations:
+def empty_marginal_equations(system: Marginal) -> MarginalEquations:
     n = system.seen.points.shape[0]
     size = 2 * n if system.integrates else 0
     normal = empty_equations(POSE_UNKNOWNS)
-    return PosedEquations(
+    return MarginalEquations(
         normal,
         normal.gradient,
         np.empty((POSE_UNKNOWNS + 1, 2 * n)),
@@ -133,15 +133,15 @@ def empty_posed_equations(system: Posed) -> PosedEquations:
     )
 
 
-@allocate.of(Posed)
+@allocate.of(Marginal)
 @kernel
-def _allocate(system: Posed) -> tuple[PosedEquations, PosedEquations]:
-    return empty_posed_equations(system), empty_posed_equations(system)
+def _allocate(system: Marginal) -> tuple[MarginalEquations, MarginalEquations]:
+    return empty_marginal_equations(system), empty_marginal_equations(system)
 
 
-@evaluate.of(Posed)
+@evaluate.of(Marginal)
 @kernel
-def evaluate_posed(system: Posed, state: FloatArray, equations: PosedEquations) -> float:
+def evaluate_marginal(system: Marginal, state: FloatArray, equations: MarginalEquations) -> float:
     """Write the equations at a state; returns the cost, infinite behind the camera."""
     cost = _write_rows(system, state, equations)
     if not cost < np.inf:
@@ -167,8 +167,8 @@ def evaluate_posed(system: Posed, state: FloatArray, equations: PosedEquations) 
     return cost
 
 
-@borrowing
-def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> float:
+@borrow
+def _write_rows(system: Marginal, state: FloatArray, equations: MarginalEquations) -> float:
     seen, mean = system.seen, system.target.mean
     rows, by_shape, points = equations.rows, equations.by_shape, equations.points
     n = mean.shape[0]
@@ -208,7 +208,7 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
 
 
 @fast_sums
-def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -> None:
+def _write_slopes(system: Marginal, state: FloatArray, equations: MarginalEquations) -> None:
     """Write half the derivatives of log det M by points and pose."""
     points, square, lever = equations.points, equations.square, equations.lever
     covariance, mean = system.target.covariance, system.target.mean
@@ -246,7 +246,7 @@ def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -
 
 
 @fast_sums
-def _shift_mean(system: Posed, state: FloatArray, equations: PosedEquations) -> None:
+def _shift_mean(system: Marginal, state: FloatArray, equations: MarginalEquations) -> None:
     """Subtract A S h from the residuals, and update the constant of the predicted decrease."""
     covariance, slope, by_shape = system.target.covariance, equations.slope, equations.by_shape
     for i in range(slope.shape[0] // 3):
@@ -259,11 +259,11 @@ def _shift_mean(system: Posed, state: FloatArray, equations: PosedEquations) -> 
             equations.sums[0] += slope[3 * i + a] * (total + 2.0 * state[POSE + 3 * i + a])
 
 
-@cost_at.of(Posed)
+@cost_at.of(Marginal)
 @kernel
-def posed_cost(system: Posed, state: FloatArray) -> float:
+def marginal_cost(system: Marginal, state: FloatArray) -> float:
     if system.integrates:
-        return evaluate_posed(system, state, empty_posed_equations(system))
+        return evaluate_marginal(system, state, empty_marginal_equations(system))
     seen, points = system.seen, system.target.mean.copy()
     size = 3 * points.shape[0]
     prior = 0.0
@@ -276,9 +276,11 @@ def posed_cost(system: Posed, state: FloatArray) -> float:
     return keypoint_cost(keypoints, pose) + prior
 
 
-@solve.of(Posed)
+@solve.of(Marginal)
 @fast_sums
-def _solve(system: Posed, equations: PosedEquations, damping: float, step: FloatArray) -> float:
+def _solve(
+    system: Marginal, equations: MarginalEquations, damping: float, step: FloatArray
+) -> float:
     expected = solve_damped(equations.normal, POSE_UNKNOWNS, damping, step)
     if expected != expected:
         return np.nan
@@ -296,12 +298,12 @@ def _solve(system: Posed, equations: PosedEquations, damping: float, step: Float
     return expected
 
 
-@move.of(Posed)
+@move.of(Marginal)
 @fast_sums
 def _move(
-    system: Posed,
+    system: Marginal,
     state: FloatArray,
-    equations: PosedEquations,
+    equations: MarginalEquations,
     damping: float,
     step: FloatArray,
     moved: FloatArray,
@@ -329,13 +331,13 @@ def _move(
         moved[POSE + k] = state[POSE + k] + share * (total - state[POSE + k])
 
 
-@score_of.of(Posed)
+@score_of.of(Marginal)
 @kernel
-def _score_of(system: Posed, state: FloatArray, cost: float) -> float:
+def _score_of(system: Marginal, state: FloatArray, cost: float) -> float:
     if not system.integrates:
         return cost
-    equations = empty_posed_equations(system)
-    score = evaluate_posed(system, state, equations)
+    equations = empty_marginal_equations(system)
+    score = evaluate_marginal(system, state, equations)
     factor = equations.normal.hessian
     for k in range(3):
         factor[k, k] += _LEAST_INFORMATION
@@ -356,9 +358,9 @@ def _mean_depth(mean: FloatArray, state: FloatArray) -> float:
     return float(total / mean.shape[0])
 
 
-@are_same.of(Posed)
-@inlined
-def _are_same(system: Posed, first: FloatArray, second: FloatArray) -> bool:
+@are_same.of(Marginal)
+@inline
+def _are_same(system: Marginal, first: FloatArray, second: FloatArray) -> bool:
     square = 0.0
     for k in range(9):
         square += (first[k] - second[k]) ** 2

@@ -62,7 +62,7 @@ def coordinates_of(seen: Seen) -> IntArray:
 
 
 def shape_at(mixture: Mixture, component: int, seen: Seen, state: FloatArray) -> FloatArray:
-    """All points (m, 3) of the shape at a state of `cadalign.solvers.marginal.equations.Posed`."""
+    """All points (m, 3) of the shape at a state of `solvers.marginal.equations.Marginal`."""
     force = state[len(state) - 3 * len(seen.points) :]
     moved = mixture.covariances[component][:, coordinates_of(seen)] @ force
     return np.asarray(mixture.means[component] + moved.reshape(-1, 3))

@@ -14,7 +14,7 @@ from cadalign.solvers.alignment import Objective, center_and_unit
 from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.linalg import copy_into, eigenvectors_4, factorize, solve_factor
-from cadalign.solvers.marginal.equations import POSE, Posed
+from cadalign.solvers.marginal.equations import POSE, Marginal
 from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, mixture_at, target_of
 from cadalign.solvers.search import Effort, Minima, empty_minima, refine_integrated, search
 from cadalign.solvers.starts import rotation_starts, widen_by_shape
@@ -69,7 +69,7 @@ def _search_mixture(
         for s in range(chosen.shape[0]):
             copy_into(states[s, :POSE], starts[chosen[s]])
         effort = Effort(chosen.shape[0], _PROBE_ITERATIONS, 0, _UNLIKELY)
-        plain = Posed(target_of(mixture, g), seen, False)
+        plain = Marginal(target_of(mixture, g), seen, False)
         search(plain, states, effort, g, mixture.penalties[g], likely)
     found = likely.counts[0]
     minima = empty_minima(max(found, 1), POSE + 6 * n)
@@ -80,7 +80,7 @@ def _search_mixture(
         if is_left[g]:
             is_left[g] = False
             target, penalty = target_of(mixture, g), mixture.penalties[g]
-            plain, whole = Posed(target, seen, False), Posed(target, seen, True)
+            plain, whole = Marginal(target, seen, False), Marginal(target, seen, True)
             refine_integrated(
                 plain, whole, likely, _MAX_ITERATIONS, _LESS_LIKELY, g, penalty, minima
             )

@@ -158,7 +158,7 @@ def test_the_exit_nearest_to_each_sample_is_its_rim(
     contour = Contour(points, np.tile([1.0, 0.0], (count, 1)), np.zeros(count, dtype=int))
     rims = find_rims(cast(Sight, sight), contour, reach)
     steps = np.linspace(-reach, reach, 2 * int(min(np.ceil(reach / 1.5), 24)) + 1)
-    covered = sight.covers(contour.at(steps[:, None] + np.zeros(count)))
+    covered = sight.covers(contour.offset_points(steps[:, None] + np.zeros(count)))
     for start, column, found, offset in zip(
         starts, covered.T, rims.found, rims.offset, strict=True
     ):
@@ -177,7 +177,7 @@ def test_an_uneven_mask_that_is_met_in_parts_alone_is_doubted() -> None:
     mask[30:70, 20:80] = True
     camera = Camera(100, 100, 100, 100, 49.5, 49.5)
     view = View(camera, [[30, 40], [60, 40], [50, 60]], mask=mask)
-    source = MaskSource.of(0, view, camera)
+    source = MaskSource.from_view(0, view, camera)
     uneven = OutlineSupport(share=0.75, agreeing=100, rms=1.8, rms_sigmas=1.0)
     assert "only 75 % of its contour meets" in (source.doubt(uneven) or "")
     for support in (uneven._replace(rms=0.1), uneven._replace(share=0.97)):

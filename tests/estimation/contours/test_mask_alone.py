@@ -64,7 +64,7 @@ def test_of_equal_poses_one_is_a_start() -> None:
 
 def test_a_prior_on_the_focal_length_is_enough() -> None:
     truth = posed(0)
-    view = View(Camera.without_focal(320, 240), mask=mask_of(body(), truth))
+    view = View(Camera.drop_focal(320, 240), mask=mask_of(body(), truth))
     model = Model(mesh=body())
     found = align(model, view, focal="estimate", focal_prior=FocalPrior(470, 0.08))
     assert rotation_error(est=found.alignment, gt=truth) < 1
@@ -125,7 +125,7 @@ class TestOwnModel:
 
     def test_mask_that_is_cut_out_generously(self) -> None:
         """The contour's distance from the rims exceeds the noise."""
-        truth, camera = posed(0, (1.0, 0.8, 1.2)), CAMERA.resized(640, 480)
+        truth, camera = posed(0, (1.0, 0.8, 1.2)), CAMERA.resize(640, 480)
         mask = cast_geometry(Scene(body()), camera, truth).mask.astype(np.uint8)
         wide = cv2.dilate(mask, np.ones((13, 13), np.uint8)) > 0
         found = align(Model(mesh=body()), View(camera, mask=wide))
@@ -144,7 +144,7 @@ class TestOwnModel:
 
     def test_probabilities_of_a_large_photo(self) -> None:
         """Starts use a smaller copy of the mask, the last rounds the mask itself."""
-        truth, camera = posed(0, (1.0, 1.2, 0.8)), CAMERA.resized(1280, 960)
+        truth, camera = posed(0, (1.0, 1.2, 0.8)), CAMERA.resize(1280, 960)
         mask = cast_geometry(Scene(body()), camera, truth).mask.astype(np.float32)
         soft = np.clip(cv2.GaussianBlur(mask, (0, 0), 3.0), 0.0, 1.0)
         found = align(Model(mesh=body()), View(camera, mask=soft, mask_sigma=1.0))

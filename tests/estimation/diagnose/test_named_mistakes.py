@@ -315,13 +315,13 @@ def right(root: Path, kind: str, category: str, seed: int) -> str:
     if kind == "near":
         return fitted(seen(root, category, seed, distance=(0.9, 1.3)))
     if kind == "small image":
-        camera = CAMERA.resized(160, 120)
+        camera = CAMERA.resize(160, 120)
         return fitted(seen(root, category, seed, camera=camera, noise_px=0.5), sigma=0.5)
     if kind == "cropped":
-        given = seen(root, category, seed, camera=CAMERA.cropped(180, 130, 300, 220))
+        given = seen(root, category, seed, camera=CAMERA.crop(180, 130, 300, 220))
         return fitted(given)
     if kind == "far to the side":
-        given = seen(root, category, seed, camera=CAMERA.cropped(0, 0, 420, 300))
+        given = seen(root, category, seed, camera=CAMERA.crop(0, 0, 420, 300))
         return fitted(given)
     if kind == "unknown noise":
         return fitted(seen(root, category, seed), **SIMILAR)

@@ -104,7 +104,7 @@ def test_principal_points_of_other_images_are_named(camera: Camera, words: str) 
 
 @pytest.mark.parametrize("corner", [(100, 50), (150, 100), (40, 0)])
 def test_principal_points_of_parts_of_photos_are_not(corner: tuple[int, int]) -> None:
-    camera = CAMERA.cropped(*corner, 480, 360)
+    camera = CAMERA.crop(*corner, 480, 360)
     points, pixels = _seen_by(camera)
     assert "principal" not in " ".join(map(str, fit(points, pixels, camera).warnings))
 

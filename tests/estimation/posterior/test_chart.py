@@ -32,7 +32,7 @@ def chart_of(result: cadalign.Result, widening: float = 1.0) -> Chart:
     options = result.options
     assert isinstance(options, FitOptions)
     keypoints = FittedKeypoints(POINTS, view.residuals, view.inliers, alignment, camera, options)
-    return Chart.of(keypoints, widening)
+    return Chart.from_fit(keypoints, widening)
 
 
 def moved(result: cadalign.Result, deviation: np.ndarray) -> tuple[Alignment, Camera]:

@@ -158,7 +158,7 @@ def test_every_door_gives_the_same(sigma: float | None) -> None:
         for other in (of_batch, align(model, view), of_align_batch):
             assert other.cost == result.cost
             assert other.sigma == result.sigma
-            np.testing.assert_array_equal(other.alignment.packed, result.alignment.packed)
+            np.testing.assert_array_equal(other.alignment.vector, result.alignment.vector)
             np.testing.assert_array_equal(other.covariance, result.covariance)
         bounded += largest_log_scale(result.alignment) > np.log(USUAL_STRETCH)
     assert bounded

@@ -39,7 +39,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "what_to_ask.md"
 # --- keypoints of one view ------------------------------------------------------------------------
 
 GOOD = problem_of(3, points=8, noise_px=0.0)
-UNKNOWN = Camera.without_focal(640, 480)
+UNKNOWN = Camera.drop_focal(640, 480)
 BENT = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (-0.4, 0.0, 0.0, 0.0))
 FAR = GOOD.points_2d.copy()
 FAR[5] = [5000, 240]
@@ -80,7 +80,7 @@ def in_plane(axis: int, **options: Any) -> Callable[[], object]:
 def at_random(count: int, **options: Any) -> Callable[[], object]:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (count, 3))
-    return fitted(points, rng.uniform(0, 480, (count, 2)), UNKNOWN.with_focal(600.0), **options)
+    return fitted(points, rng.uniform(0, 480, (count, 2)), UNKNOWN.replace_focal(600.0), **options)
 
 
 KEYPOINTS = {
@@ -126,7 +126,7 @@ KEYPOINTS = {
     "plane z": in_plane(2),
     "plane seen along its normal, focal length unknown": fitted(
         GOOD.points_3d * [1, 1, 0],
-        UNKNOWN.with_focal(935.0).project(GOOD.points_3d * [1, 1, 0] + [0.1, 0, 5]),
+        UNKNOWN.replace_focal(935.0).project(GOOD.points_3d * [1, 1, 0] + [0.1, 0, 5]),
         UNKNOWN,
         focal="estimate",
         focal_prior=None,

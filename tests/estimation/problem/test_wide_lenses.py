@@ -107,7 +107,7 @@ def test_a_batch_is_each_fit() -> None:
     batch = fit_batch(points, pixels, cameras)
     for k, own in enumerate(batch):
         single = fit(points[k], pixels[k], cameras[k])
-        np.testing.assert_array_equal(own.alignment.packed, single.alignment.packed)
+        np.testing.assert_array_equal(own.alignment.vector, single.alignment.vector)
         np.testing.assert_allclose(batch.rotation[k], single.alignment.rotation)
         assert own.covariance is not None
         assert single.covariance is not None
@@ -153,7 +153,7 @@ def test_align_exact_similar_and_learned_shapes(angle: float) -> None:
         assert result.rms < 2
         again = Result.from_dict(result.to_dict())
         assert again.camera == FISHEYE
-        np.testing.assert_allclose(again.alignment.packed, result.alignment.packed)
+        np.testing.assert_allclose(again.alignment.vector, result.alignment.vector)
 
 
 def test_robust_alignment_of_a_learned_shape() -> None:
@@ -301,7 +301,7 @@ class TestPictures:
         assert {each.kind for each in found.evidence} >= {names[0].replace("image", "photo")}
 
     def test_a_mask_alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(TestPictures, "CAMERA", self.CAMERA.resized(320, 320))
+        monkeypatch.setattr(TestPictures, "CAMERA", self.CAMERA.resize(320, 320))
         view, truth = self.seen(95, "mask", keypoints=False)
         found = align(self.model(), view)
         assert degrees_off(found, truth) < 2.5 * found.std.rotation_deg < 5.0

@@ -249,7 +249,11 @@ def test_the_rig_frame_is_that_of_the_cameras() -> None:
 
 def plain_evidence(prior: ShapePrior, views: list[View]) -> Evidence:
     """Evidence for the first component, with known cameras without turns."""
-    given = {"options": FitOptions(), "lenses": Lenses.of(views, "known", None), "noise": 1.0}
+    given = {
+        "options": FitOptions(),
+        "lenses": Lenses.from_views(views, "known", None),
+        "noise": 1.0,
+    }
     turns = [np.eye(3)] * len(views)
     return evidence_of(prior, prior.components[0], views, None, turns=turns, **given)
 
@@ -267,7 +271,7 @@ def test_points_that_are_no_keypoints_end_no_box() -> None:
     views = [seen(keypoints(12), truth_of((1, 1, 1)), np.eye(4))]
     evidence = plain_evidence(prior, views)
     modes, mean = evidence.shape.modes, evidence.shape.mean
-    pose = truth_of((1, 1, 1)).packed[None, :12]
+    pose = truth_of((1, 1, 1)).vector[None, :12]
     state = State(pose, np.zeros(0), np.zeros(3), np.zeros(len(modes)), np.zeros_like(mean))
     margins = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
     farthest = int(mean[2:12, 0].argmax()) + 2

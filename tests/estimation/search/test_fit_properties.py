@@ -12,7 +12,7 @@ from support.problems import of_unknowns, problem_of
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
-from cadalign.geometry.camera import turned_alignment
+from cadalign.geometry.camera import rotate_alignment
 from cadalign.metrics import rotation_error
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -95,7 +95,7 @@ def test_equivariance_under_turning_the_image(
     points_2d = (problem.points_2d - center) @ turn[:2, :2].T + center
     before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
     after = fit(problem.points_3d, points_2d, problem.camera, method=method)
-    assert_aligned(after, turned_alignment(before.alignment, turn), 1e-4)
+    assert_aligned(after, rotate_alignment(before.alignment, turn), 1e-4)
 
 
 @given(seed=SEEDS, points=COUNTS)

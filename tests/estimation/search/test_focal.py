@@ -29,7 +29,7 @@ from cadalign.errors import DegenerateError, NoConsensusError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.metrics import rotation_error
 
-UNKNOWN = Camera.without_focal(640, 480)
+UNKNOWN = Camera.drop_focal(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 
 
@@ -43,7 +43,7 @@ def whitened(
     problem: SimulatedProblem, alignment: Alignment, camera: Camera, step: np.ndarray
 ) -> np.ndarray:
     """Residuals after a step of the 9 unknowns, in the documented order."""
-    seen = camera.with_focal(camera.fx * np.exp(step[8]))
+    seen = camera.replace_focal(camera.fx * np.exp(step[8]))
     return seen.project(moved(alignment, step).apply(problem.points_3d)) - problem.points_2d
 
 
@@ -234,7 +234,7 @@ def test_prior_that_the_keypoints_contradict_is_said_so() -> None:
 
 def test_prior_of_usual_lenses_is_the_default_and_is_told() -> None:
     problem = problem_of(2, points=20, noise_px=1.0, camera=LONG, depth=(6.0, 9.0))
-    usual = FocalPrior.of_usual_lenses(640, 480)
+    usual = FocalPrior.from_size(640, 480)
     result = fit(problem.points_3d, problem.points_2d, UNKNOWN, focal="estimate")
     assert result.focal_prior == usual
     assert f"(prior: {usual})" in str(result)
@@ -255,13 +255,13 @@ def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
         problem_of(seed, points=12, camera=Camera.from_fov(width, 480, fov_x=40.0))
         for seed, width in enumerate((640, 1280))
     ]
-    cameras = [Camera.without_focal(p.camera.width, 480) for p in problems]
+    cameras = [Camera.drop_focal(p.camera.width, 480) for p in problems]
     points = [p.points_3d for p in problems], [p.points_2d for p in problems]
     batch = fit_batch(*points, cameras, focal="estimate")
     for b, camera in enumerate(cameras):
         single = fit(problems[b].points_3d, problems[b].points_2d, camera, focal="estimate")
         assert batch.focal_length[b] == single.camera.fx
-        assert single.focal_prior == FocalPrior.of_usual_lenses(camera.width, 480)
+        assert single.focal_prior == FocalPrior.from_size(camera.width, 480)
 
 
 @pytest.mark.long

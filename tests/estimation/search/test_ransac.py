@@ -84,7 +84,7 @@ def test_keypoints_with_their_own_sigmas_have_the_threshold_of_these(shape: str)
     one = fit(*given, sigma=2.0, ransac=RansacOptions())
     each = fit(*given, sigma=own, ransac=RansacOptions())
     assert (each.inliers == one.inliers).all()
-    np.testing.assert_allclose(each.alignment.packed, one.alignment.packed, atol=1e-6)
+    np.testing.assert_allclose(each.alignment.vector, one.alignment.vector, atol=1e-6)
 
 
 def test_order_of_the_keypoints_does_not_matter() -> None:
@@ -173,7 +173,7 @@ def test_what_is_advised_for_keypoints_in_one_plane_fits_them() -> None:
 @pytest.mark.parametrize("minimal", ["ap4p", "aepnp"])
 def test_unknown_focal_length_is_found_by_either_minimal_solver(minimal: str) -> None:
     problem, points_2d, wrong = spoiled(0, points=40, outliers=8)
-    camera = Camera.without_focal(CAMERA.width, CAMERA.height)
+    camera = Camera.drop_focal(CAMERA.width, CAMERA.height)
     ransac = RansacOptions(minimal=minimal)
     result = fit(problem.points_3d, points_2d, camera, focal="estimate", ransac=ransac)
     assert not result.inliers[wrong].any()

@@ -124,7 +124,7 @@ class PosedScene:
         """Diagonal of the stretched model's bounding box [model units]."""
         return self.scene.stretched_diagonal(self._alignment)
 
-    def blocked(
+    def occlusion_mask(
         self, points_cam: FloatArray, directions: FloatArray, *, reach: float
     ) -> npt.NDArray[np.bool_]:
         """Mark rays that hit the object within a distance, (n,) bool.
@@ -133,7 +133,7 @@ class PosedScene:
         model units.
         """
         columns = self._model_from_ray.T
-        return self._caster.blocked(
+        return self._caster.occlusion_mask(
             (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
         )
 

@@ -15,7 +15,7 @@ import numpy as np
 from cadalign.annotate.marks import ObjectShape, Pair
 from cadalign.annotate.photos import ObjectMask, segment_box
 from cadalign.annotate.session import Annotation, Session
-from cadalign.errors import InputError, quote, unknown
+from cadalign.errors import InputError, quote, unknown_name
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Finite, ForeignDocument, Index, Point2, Point3, Text, convert
 from cadalign.io.images import read_photo
@@ -114,7 +114,7 @@ def category(state: Annotation, *, name: Text) -> ActionOutcome:
     if not state.can_exchange:
         raise InputError("only categories that come with cadalign can be exchanged", where="name")
     if name not in CATEGORIES:
-        raise unknown("category", name, CATEGORIES, where="name")
+        raise unknown_name("category", name, CATEGORIES, where="name")
     before = len(state.marks.complete_pairs)
     state.exchange_shape(ObjectShape.open(Path(name)))
     kept = len(state.marks.complete_pairs)

@@ -64,8 +64,6 @@ def missing_text(counts: BoolArray, shape: ObjectShape, observation: Observation
     if missing <= 0:
         return ""
     text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
-    if observation.model is None:
-        return f"{text}."
     if not counts.all() and shape.learned is not None:
         text += f": keypoints that {shape.learned.category} has, the white points on the model"
     return text

@@ -118,7 +118,7 @@ def test_two_pairs_need_two_more(photo: Path) -> None:
     for keypoint, uv in ((0, [10, 20]), (1, [300, 20])):
         perform(session, 0, {"do": "take", "keypoint": keypoint, "uv": uv})
     message = page_state(session, 0)["alignment"]["message"]
-    assert message == "2 more pairs to the first alignment."
+    assert message == "2 more pairs to the first alignment"
 
 
 def test_four_clicks_align_and_the_rest_is_taken_and_reopened(

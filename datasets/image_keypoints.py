@@ -192,7 +192,7 @@ def join_keypoints(
     found : ImageKeypoints
     model : ModelKeypoints
     camera : Camera
-        The photo's camera; `Camera.drop_focal` if its focal length is unknown.
+        The photo's camera; `Camera.from_size` if its focal length is unknown.
     image : Path, optional
         The photo.
     min_score : float
@@ -276,7 +276,7 @@ def observe_keypoints(
         fix = "give the photo, or the camera"
         raise DataError("the photo's size is unknown", where=found.source, fix=fix)
     require_one_size(sizes, image)
-    camera = camera or Camera.drop_focal(*next(iter(sizes.values())))
+    camera = camera or Camera.from_size(*next(iter(sizes.values())))
     return replace(changes, camera=None).apply(
         join_keypoints(found, model, camera, image=image, **how)
     )

@@ -122,7 +122,7 @@ class Pascal3D(PhotoDataset):
         image = find_first_file(self.root / _IMAGES / f"{name}{end}" for end in _ENDINGS)
         if image is None:
             raise DataError(f"its image is not in {_IMAGES}", where=str(path))
-        camera = Camera.drop_focal(*photo_size(image))
+        camera = Camera.from_size(*photo_size(image))
 
         def read_object(number: int, each: Any) -> PhotoObject | None:
             shown: _Object = convert(each, _Object)

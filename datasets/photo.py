@@ -151,7 +151,7 @@ class Photo:
     image: Path | None
     """The image file; None if it is missing."""
     camera: Camera | None
-    """The camera, `Camera.drop_focal` if the focal length is unknown; None if the image's size
+    """The camera, `Camera.from_size` if the focal length is unknown; None if the image's size
     is unknown, too."""
     objects: tuple[PhotoObject, ...]
     """The objects whose annotation could be read."""

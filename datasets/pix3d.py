@@ -127,7 +127,7 @@ def _read_keypoints(path: Path) -> NamedPoints:
 @lru_cache(maxsize=64)
 def _camera(width: int, height: int, focal_length: float) -> Camera:
     """The camera for an image size [px] and a focal length [mm]."""
-    return Camera.drop_focal(width, height).replace_focal(focal_length / _SENSOR * width)
+    return Camera.from_size(width, height).replace_focal(focal_length / _SENSOR * width)
 
 
 def _truth(entry: _Entry) -> Truth:

@@ -195,7 +195,7 @@ def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
     camera = state.marks.camera
     low, high = (bound * camera.width for bound in _FOCAL_RANGE)
     if pixels is None:
-        camera = Camera.drop_focal(
+        camera = Camera.from_size(
             camera.width,
             camera.height,
             cx=camera.cx,

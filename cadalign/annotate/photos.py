@@ -91,7 +91,7 @@ def find_photos(path: Path) -> list[Path]:
 def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
     """Return a photo's camera, by default without a focal length; raises DataError for others."""
     if camera is None:
-        return Camera.drop_focal(photo.width, photo.height)
+        return Camera.from_size(photo.width, photo.height)
     if (camera.width, camera.height) != (photo.width, photo.height):
         raise DataError(
             f"the photo has {photo.width} x {photo.height} pixels, the camera "

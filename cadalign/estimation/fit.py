@@ -63,7 +63,7 @@ def fit(
         The same keypoints in the image [px]; integers are pixel centres.
     camera : Camera
         The calibrated camera, with its lens distortion. With ``focal="estimate"`` its focal length
-        is ignored: `Camera.drop_focal` has none.
+        is ignored: `Camera.from_size` has none.
     method : {"optimal", "aepnp", "aepnp-paper", "epnp"}
         - ``optimal``: global search for the maximum-likelihood alignment; at least 5 points. With
           4 points, all alignments that reproject exactly, the least stretched first.
@@ -131,7 +131,7 @@ def fit(
 
     The same photo without its focal length, which is 150 px:
 
-    >>> camera = Camera.drop_focal(640, 480)
+    >>> camera = Camera.from_size(640, 480)
     >>> unknown = {"focal": "estimate", "focal_prior": None}
     >>> result = fit(problem.points_3d, problem.points_2d, camera, **unknown)
     >>> round(result.camera.fx, 3)

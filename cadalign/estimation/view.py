@@ -48,7 +48,7 @@ class View:
     Parameters
     ----------
     camera : Camera
-        The calibrated camera; `Camera.drop_focal` where the focal length is to be estimated.
+        The calibrated camera; `Camera.from_size` where the focal length is to be estimated.
     points_2d : (n, 2) float
         Keypoints in the image [px]; integers are pixel centres.
     ids : sequence of n int or str, optional

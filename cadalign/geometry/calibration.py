@@ -150,7 +150,7 @@ class Calibration:
         return cls(width, height, fx, fy, cx - shift, cy - shift, distortion, lens=lens)
 
     @classmethod
-    def drop_focal(
+    def from_size(
         cls: type[_C],
         width: int,
         height: int,
@@ -167,7 +167,7 @@ class Calibration:
         Examples
         --------
         >>> from cadalign import Camera
-        >>> camera = Camera.drop_focal(640, 480)
+        >>> camera = Camera.from_size(640, 480)
         >>> camera.cx, camera.cy, camera.focal_known
         (319.5, 239.5, False)
         >>> camera.replace_focal(700).fy
@@ -270,7 +270,7 @@ class Calibration:
             COLMAP's form, see `to_dict`: ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
             OPENCV, FULL_OPENCV or OPENCV_FISHEYE), ``width``, ``height``, and ``params`` in
             COLMAP's order. With None as focal lengths, or with ``width`` and ``height`` alone, the
-            camera is made by `drop_focal`. The other form: ``matrix`` (3, 3), ``width``,
+            camera is made by `from_size`. The other form: ``matrix`` (3, 3), ``width``,
             ``height`` and optionally ``distortion`` and ``lens``, see `from_matrix`. Both forms
             accept ``pixel_origin``, by default ``"corner"`` with ``params`` and ``"center"`` with
             ``matrix``.
@@ -293,7 +293,7 @@ class Calibration:
         if not isinstance(data, Mapping):
             raise InputError(f"expected an object, got {type(data).__name__}", where="camera")
         if set(data) - {"pixel_origin"} == {"width", "height"}:
-            return cls.drop_focal(data["width"], data["height"])
+            return cls.from_size(data["width"], data["height"])
         kind = "matrix" if "matrix" in data and "params" not in data else "params"
         missing = [key for key in _FORMS[kind] if key not in data]
         if missing:
@@ -305,7 +305,7 @@ class Calibration:
             return cls.from_matrix(**given)
         shift = shift_of(data.get("pixel_origin", "corner"), where="camera.pixel_origin")
         fields = _read_params(data["model"], data["params"], shift)
-        make = cls if "fx" in fields else cls.drop_focal
+        make = cls if "fx" in fields else cls.from_size
         return make(width=data["width"], height=data["height"], **fields)
 
 

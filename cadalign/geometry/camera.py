@@ -52,7 +52,7 @@ class Camera(Calibration):
         Kind of lens. A fisheye may see points beside and behind the camera. Its focal length must
         be known.
     focal_known : bool
-        False if the focal lengths are placeholders; see `drop_focal`.
+        False if the focal lengths are placeholders; see `from_size`.
 
     Raises
     ------

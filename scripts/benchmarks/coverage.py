@@ -67,7 +67,7 @@ def _coverage(stream: tuple[int, int, int], *, kind: str) -> Row:
         seen[0][wrong] = rng.uniform(0, (640, 480), (len(wrong), 2))
         options["ransac"] = RansacOptions()
     elif kind == "focal":
-        camera, options["focal"] = Camera.drop_focal(640, 480), "estimate"
+        camera, options["focal"] = Camera.from_size(640, 480), "estimate"
     if kind == "two views" or differs:
         views = [View(camera, each, sigma=_NOISE_PX) for each in seen]
         own = Model(points_3d=model, shape_sigma=differs) if differs else Model(points_3d=model)
@@ -144,7 +144,7 @@ def _models(seen: UnseenObject, shape: ShapeModel, rng: np.random.Generator) -> 
         model=shape, ids=seen.ids[known].tolist(), points_2d=seen.points_2d[known]
     )
     robust = {"ransac": RansacOptions()}
-    unknown = {"camera": Camera.drop_focal(640, 480), "options": {"focal": "estimate"}}
+    unknown = {"camera": Camera.from_size(640, 480), "options": {"focal": "estimate"}}
     return {
         "own": own,
         "own, RANSAC": own._replace(options=robust),

@@ -25,7 +25,7 @@ BOX = Mesh(
     [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
     [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]],
 )
-UNKNOWN = Camera.drop_focal(640, 480)
+UNKNOWN = Camera.from_size(640, 480)
 WEAK = 0.8  # prior on the stretch of simulated problems, whose scales are 0.5 to 2
 
 

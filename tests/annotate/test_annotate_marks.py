@@ -13,7 +13,7 @@ from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 
-CAMERA = Camera.drop_focal(640, 480)
+CAMERA = Camera.from_size(640, 480)
 EMPTY = Marks(CAMERA)
 
 

@@ -85,7 +85,7 @@ def test_priors_of_a_file_count_and_are_kept(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
     instance, options = case.instance, {"stretch_sigma": 0.1, "focal_prior": None}
-    camera = Camera.drop_focal(instance.camera.width, instance.camera.height)
+    camera = Camera.from_size(instance.camera.width, instance.camera.height)
     Observation(instance.points_3d, instance.points_2d, camera, fit_options=options).save(
         case.observation
     )

@@ -124,7 +124,7 @@ def test_unknown_focal_length_of_two_views_is_estimated(
 ) -> None:
     path = drop_focal(write(tmp_path, observed(0.0), observed(25.0)))
     assert main(["fit", str(path)]) == 0
-    unknown = Camera.drop_focal(640, 480)
+    unknown = Camera.from_size(640, 480)
     views = [View(unknown, observed(angle).points_2d) for angle in (0.0, 25.0)]
     expected = align(Model(points_3d=POINTS), views, focal="estimate")
     found = result_in(tmp_path)

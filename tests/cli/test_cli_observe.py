@@ -70,7 +70,7 @@ def test_photo_and_detection_become_an_observation(
     out = folder / "found.observation.json"
     assert capsys.readouterr().out == f"24 of 24 keypoints: {out}\n"
     observation = Observation.load(out)
-    assert observation.camera == Camera.drop_focal(640, 480)
+    assert observation.camera == Camera.from_size(640, 480)
     assert observation.names == tuple(NAMES)
     np.testing.assert_allclose(observation.points_2d, POINTS_2D)
     assert observation.scores is not None
@@ -102,7 +102,7 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     assert "  focal length " in captured.out
     prior = FocalPrior.from_exif(folder / "photo.jpg")
     expected = fit(
-        POINTS_3D, POINTS_2D, Camera.drop_focal(640, 480), focal="estimate", focal_prior=prior
+        POINTS_3D, POINTS_2D, Camera.from_size(640, 480), focal="estimate", focal_prior=prior
     )
     assert result.camera.fx == pytest.approx(expected.camera.fx, rel=1e-9)
     assert result.camera.fx == pytest.approx(620, rel=0.03)

@@ -21,7 +21,7 @@ from cadalign.datasets import (
 from cadalign.datasets.image_keypoints import find_photo
 from cadalign.errors import CadalignError, DataError, InputError
 
-CAMERA = Camera.drop_focal(640, 480)
+CAMERA = Camera.from_size(640, 480)
 MODEL = ModelKeypoints(
     (
         ModelKeypoint("left ear", (0.0, 1.0, 0.0), semantic_id=4),

@@ -100,9 +100,7 @@ def _exact_focal(rng: np.random.Generator) -> Case:
     points = _cloud(rng, 7, 20)
     pose = draw_pose(rng)
     camera = (
-        Camera.drop_focal(640, 480)
-        if rng.random() < 0.5
-        else Camera(640, 480, 90, 90, 319.5, 239.5)
+        Camera.from_size(640, 480) if rng.random() < 0.5 else Camera(640, 480, 90, 90, 319.5, 239.5)
     )
     focal = float(np.exp(rng.uniform(np.log(150), np.log(2000))))
     seen = _pixels(pose, points, Camera(640, 480, focal, focal, 319.5, 239.5))

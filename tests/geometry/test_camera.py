@@ -308,25 +308,25 @@ def test_project_refuses_wrong_points(points: Any, text: str) -> None:
 
 
 def test_camera_without_focal_length_has_its_principal_point_in_the_centre() -> None:
-    camera = Camera.drop_focal(641, 480)
+    camera = Camera.from_size(641, 480)
     assert (camera.cx, camera.cy) == (320.0, 239.5)
     assert not camera.focal_known
     assert camera.fx == camera.fy
-    given = Camera.drop_focal(640, 480, cx=300.0, cy=200.0, distortion=(0.1, 0, 0, 0))
+    given = Camera.from_size(640, 480, cx=300.0, cy=200.0, distortion=(0.1, 0, 0, 0))
     assert (given.cx, given.cy, given.distortion) == (300.0, 200.0, (0.1, 0.0, 0.0, 0.0))
 
 
 def test_replace_focal_makes_the_focal_length_known() -> None:
-    camera = Camera.drop_focal(640, 480).replace_focal(700)
+    camera = Camera.from_size(640, 480).replace_focal(700)
     assert camera == Camera(640, 480, 700, 700, 319.5, 239.5)
-    assert camera != Camera.drop_focal(640, 480)
+    assert camera != Camera.from_size(640, 480)
     stretched = Camera(640, 480, 500, 550, 320, 240).replace_focal(1000)
     assert (stretched.fx, stretched.fy) == (1000.0, 1100.0)
 
 
 @pytest.mark.parametrize("use", ["project", "normalize"])
 def test_camera_without_focal_length_refuses_projection(use: str) -> None:
-    camera = Camera.drop_focal(640, 480)
+    camera = Camera.from_size(640, 480)
     points = [[0.0, 0.0, 2.0]] if use == "project" else [[3.0, 4.0]]
     with pytest.raises(InputError) as caught:
         getattr(camera, use)(points)
@@ -349,7 +349,7 @@ NO_FOCAL = COLMAP_DATA | {"params": [None, None, 320.0, 240.0]}
 )
 def test_unknown_focal_length_is_null_in_files(data: dict[str, Any]) -> None:
     camera = Camera.from_dict(data)
-    assert camera == Camera.drop_focal(640, 480)
+    assert camera == Camera.from_size(640, 480)
     assert camera.to_dict() == NO_FOCAL
     assert Camera.from_dict(camera.to_dict()) == camera
 

@@ -56,7 +56,7 @@ def test_cameras_and_alignments_read_or_refuse_any_value(value: Any) -> None:
     read_or_refuse(lambda: Camera.from_fov(640, 480, fov_x=value))
     read_or_refuse(lambda: Camera.from_fov(value, 480, fov_x=50))
     read_or_refuse(lambda: Camera.from_fov(640, value, fov_x=50))
-    read_or_refuse(lambda: Camera.drop_focal(value, 480))
+    read_or_refuse(lambda: Camera.from_size(value, 480))
     read_or_refuse(lambda: CAMERA.replace_focal(value))
 
 

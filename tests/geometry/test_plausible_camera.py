@@ -42,7 +42,7 @@ def test_implausible_cameras_are_doubted(camera: Camera, words: str) -> None:
         RIGHT.crop(100, 50, 480, 360),
         Camera(640, 480, 520, 519, 325, 253),
         Camera(640, 480, 200, 200, 319.5, 239.5, distortion=(0.1, 0, 0, 0), lens="fisheye"),
-        Camera.drop_focal(640, 480),
+        Camera.from_size(640, 480),
     ],
     ids=["usual", "part of a photo", "calibrated", "fisheye", "unknown"],
 )

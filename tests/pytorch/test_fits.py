@@ -190,7 +190,7 @@ def test_single_precision_is_kept() -> None:
             "camera first",
         ),
         (
-            lambda p, x, c: fit(p, x, Camera.drop_focal(640, 480)),
+            lambda p, x, c: fit(p, x, Camera.from_size(640, 480)),
             "camera: the focal length is unknown; give it: camera.replace_focal(...)",
         ),
     ],

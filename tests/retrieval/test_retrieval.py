@@ -467,7 +467,7 @@ def test_too_few_shared_keypoints_are_refused() -> None:
         ({"ids": np.r_[IDS[:9], 3]}, "ids: the semantic id 3 occurs twice"),
         ({"ids": IDS + 0.5}, "ids: float64 of shape"),
         ({"camera": "none"}, "camera: expected a cadalign.Camera, got str"),
-        ({"camera": Camera.drop_focal(640, 480)}, "camera: the focal length is unknown; est"),
+        ({"camera": Camera.from_size(640, 480)}, "camera: the focal length is unknown; est"),
         ({"top": 0}, "top: must be a whole number >= 1, not 0"),
         ({"tops": 3}, "unknown option.*'tops'"),
         ({"sigma": 0.0}, "sigma: all values must be > 0"),

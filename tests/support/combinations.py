@@ -42,7 +42,7 @@ OUTLIERS = ("linear", "huber", "cauchy", "scores", "unrefined", "six")
 
 FOCAL = 500.0
 CAMERA = Camera(480, 360, FOCAL, FOCAL, 239.5, 179.5)
-UNKNOWN = Camera.drop_focal(480, 360)
+UNKNOWN = Camera.from_size(480, 360)
 HALF = np.array([0.5, 0.35, 0.25])
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * HALF
 _ON_FACES = [

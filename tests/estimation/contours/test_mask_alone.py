@@ -64,7 +64,7 @@ def test_of_equal_poses_one_is_a_start() -> None:
 
 def test_a_prior_on_the_focal_length_is_enough() -> None:
     truth = posed(0)
-    view = View(Camera.drop_focal(320, 240), mask=mask_of(body(), truth))
+    view = View(Camera.from_size(320, 240), mask=mask_of(body(), truth))
     model = Model(mesh=body())
     found = align(model, view, focal="estimate", focal_prior=FocalPrior(470, 0.08))
     assert rotation_error(est=found.alignment, gt=truth) < 1

@@ -134,7 +134,7 @@ class TestPhoto:
 
     def test_with_gravity_and_an_unknown_focal_length(self) -> None:
         shown = scene(3)
-        camera = Camera.drop_focal(CAMERA.width, CAMERA.height)
+        camera = Camera.from_size(CAMERA.width, CAMERA.height)
         up = shown.truth.rotation[:, 1]
         view = View(camera, shown.clicks, sigma=CLICK_PX, image=shown.pixels, up=up)
         found = align(shown.model(stretch="none"), view, focal="estimate")

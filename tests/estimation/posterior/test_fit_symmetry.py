@@ -162,9 +162,9 @@ def test_with_outliers_and_an_unknown_focal_length():
     assert robust.inliers.sum() == len(points) - 3
     seen = CAMERA.project(robust.alignment.apply(robust.points_3d))
     np.testing.assert_allclose(seen - wrong, robust.residuals, atol=1e-6)
-    unknown = fit(points, pixels, Camera.drop_focal(640, 480), focal="estimate",
+    unknown = fit(points, pixels, Camera.from_size(640, 480), focal="estimate",
                   stretch="y", symmetry=symmetry)  # fmt: skip
-    again = fit(unknown.points_3d, pixels, Camera.drop_focal(640, 480), focal="estimate",
+    again = fit(unknown.points_3d, pixels, Camera.from_size(640, 480), focal="estimate",
                 stretch="y")  # fmt: skip
     np.testing.assert_allclose(
         unknown.fisher_covariance, again.fisher_covariance, rtol=1e-2, atol=1e-8

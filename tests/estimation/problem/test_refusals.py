@@ -39,7 +39,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "what_to_ask.md"
 # --- keypoints of one view ------------------------------------------------------------------------
 
 GOOD = problem_of(3, points=8, noise_px=0.0)
-UNKNOWN = Camera.drop_focal(640, 480)
+UNKNOWN = Camera.from_size(640, 480)
 BENT = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (-0.4, 0.0, 0.0, 0.0))
 FAR = GOOD.points_2d.copy()
 FAR[5] = [5000, 240]

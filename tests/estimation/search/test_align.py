@@ -44,7 +44,7 @@ class TestExactModel:
         points, rng = keypoints(), np.random.default_rng(1)
         view = seen(points, truth_of(), np.eye(4), noise=rng.normal(0, 1, (10, 2)))
         if focal == "estimate":
-            view = replace(view, camera=Camera.drop_focal(640, 480))
+            view = replace(view, camera=Camera.from_size(640, 480))
         result = align(Model(points_3d=points), view, focal=focal)
         expected = fit(points, view.points_2d, view.camera, focal=focal)
         assert result.alignment == expected.alignment
@@ -217,7 +217,7 @@ class TestUnknowns:
         for camera, angle in ((CAMERA, 0.0), (wide, 30.0), (CAMERA, -30.0)):
             motion = around(angle)
             in_camera = truth.apply(keypoints()) @ motion[:3, :3].T + motion[:3, 3]
-            unknown = Camera.drop_focal(camera.width, camera.height)
+            unknown = Camera.from_size(camera.width, camera.height)
             views.append(View(unknown, camera.project(in_camera), sigma=0.2))
         result = align(model, views, focal="estimate")
         assert result.cameras[0] == result.cameras[2]

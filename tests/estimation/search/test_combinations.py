@@ -84,7 +84,7 @@ def test_the_focal_length_of_a_far_flat_object_is_uncertain(model: str, folder: 
     far = Alignment(problem.truths[0].rotation, [0.0, 0.0, 60.0], np.ones(3))
     points = np.array(model_of("held", None).points_3d)[rows]
     pixels = camera.project(far.apply(points)) + np.random.default_rng(0).normal(size=(7, 2))
-    view = View(Camera.drop_focal(480, 360), pixels, ids=rows)
+    view = View(Camera.from_size(480, 360), pixels, ids=rows)
     usual = align(model_of(model, None), view, focal="estimate")
     assert 0.3 < usual.std.focal < 0.7
     result = align(model_of(model, None), view, focal="estimate", focal_prior=None)

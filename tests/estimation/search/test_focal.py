@@ -29,7 +29,7 @@ from cadalign.errors import DegenerateError, NoConsensusError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.metrics import rotation_error
 
-UNKNOWN = Camera.drop_focal(640, 480)
+UNKNOWN = Camera.from_size(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 
 
@@ -255,7 +255,7 @@ def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
         problem_of(seed, points=12, camera=Camera.from_fov(width, 480, fov_x=40.0))
         for seed, width in enumerate((640, 1280))
     ]
-    cameras = [Camera.drop_focal(p.camera.width, 480) for p in problems]
+    cameras = [Camera.from_size(p.camera.width, 480) for p in problems]
     points = [p.points_3d for p in problems], [p.points_2d for p in problems]
     batch = fit_batch(*points, cameras, focal="estimate")
     for b, camera in enumerate(cameras):

@@ -173,7 +173,7 @@ def test_what_is_advised_for_keypoints_in_one_plane_fits_them() -> None:
 @pytest.mark.parametrize("minimal", ["ap4p", "aepnp"])
 def test_unknown_focal_length_is_found_by_either_minimal_solver(minimal: str) -> None:
     problem, points_2d, wrong = spoiled(0, points=40, outliers=8)
-    camera = Camera.drop_focal(CAMERA.width, CAMERA.height)
+    camera = Camera.from_size(CAMERA.width, CAMERA.height)
     ransac = RansacOptions(minimal=minimal)
     result = fit(problem.points_3d, points_2d, camera, focal="estimate", ransac=ransac)
     assert not result.inliers[wrong].any()

@@ -73,7 +73,7 @@ def test_unknown_focal_lengths_with_scales_drawn_at_random(scene: Colmap) -> Non
     rng = np.random.default_rng(0)
     strong = weak = 0
     for image in scene:
-        camera = Camera.drop_focal(image.camera.width, image.camera.height)
+        camera = Camera.from_size(image.camera.width, image.camera.height)
         for _ in range(3):
             scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
             unknown = {"focal": "estimate", "focal_prior": None, "sigma": None}

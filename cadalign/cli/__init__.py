@@ -43,7 +43,7 @@ COMMANDS = {  # module and class, and the first sentence of the help
         "Find the models of a library that best explain an image's keypoints.",
     ),
     "library": ("retrieve.LibraryCommand", "Build and inspect libraries of CAD models."),
-    "shape": ("shape.ShapeCommand", "Learn and inspect shape models of categories."),
+    "shape": ("shape.ShapeCommand", "Learn, list and inspect shape models of categories."),
     "evaluate": ("evaluate.Evaluate", "Evaluate methods on a dataset."),
     "simulate": (
         "evaluate.Simulate",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -120,7 +120,7 @@ def align(
     ((8, 3), 0.19)
     """
     start = time.perf_counter()
-    given = number_views(_checked_views(views))
+    given = _resolve_names(model, number_views(_checked_views(views)))
     if size is not None:
         require_kind(size, Size, "size")
     inits = _checked_inits(init, given)
@@ -153,6 +153,19 @@ def align(
         error.fix = named or error.fix
         raise
     return add_diagnosis(result, partial(diagnose, case, result=result), problem.views, ransac)
+
+
+def _resolve_names(model: object, views: list[View]) -> list[View]:
+    """Replace names of keypoints by the ids of a learned shape that has both."""
+    if not isinstance(model, ShapeModel) or not model.names:
+        return views
+    own: dict[Hashable, Hashable] = dict(zip(model.names, model.ids, strict=True))
+    return [
+        replace(view, ids=tuple(own.get(label, label) for label in view.keypoint_ids))
+        if any(label in own for label in view.keypoint_ids)
+        else view
+        for view in views
+    ]
 
 
 def _estimate(problem: Problem, start: float) -> Result:

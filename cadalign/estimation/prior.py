@@ -57,8 +57,7 @@ class ShapePrior:
 
     def rows_of(self, ids: tuple[Hashable, ...], where: str) -> list[int]:
         """Rows of keypoints; raises InputError if the model lacks one."""
-        place: dict[Hashable, int] = {name: row for row, name in enumerate(self.names)}
-        place |= {label: row for row, label in enumerate(self.ids)}
+        place = {name: row for row, name in enumerate(self.ids)}
         missing = [name for name in ids if name not in place]
         if missing:
             listed = ", ".join(quote(name) for name in missing[:5])

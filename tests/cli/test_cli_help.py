@@ -14,7 +14,7 @@ from cadalign.cli import drop_repeats, main
 
 PATHS = (
     *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
-    *("library build", "library show", "shape learn", "shape show"),
+    *("library build", "library show", "shape learn", "shape list", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate photos"),
     *("evaluate correspondences", "evaluate retrieval", "simulate"),
 )

@@ -64,6 +64,7 @@ def test_names_and_ids_give_the_same_alignment():
         for labels in (shape.ids, shape.names)
     )
     np.testing.assert_array_equal(by_id.points_3d, by_name.points_3d)
+    assert by_name.to_dict()["views"] == by_id.to_dict()["views"]
 
 
 def test_unknown_category_lists_what_there_is():

@@ -31,6 +31,7 @@ from cadalign.render import (
 from cadalign.render.canvas import ByteImage
 from cadalign.render.overlay import draw_result
 from cadalign.retrieval.folder import draw_match
+from cadalign.shapes.pretrained import CATEGORIES
 from cadalign.shapes.warp import warp_mesh
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -228,6 +229,33 @@ def _matches(dataset: KeypointNet) -> list[ByteImage]:
     return [photo, *(draw_match(photo, CHAIR_CAMERA, match) for match in matches)]
 
 
+def categories() -> None:
+    """Draw the mean keypoints of each shape that comes with the package, from two sides."""
+    from matplotlib.figure import Figure
+
+    for category in CATEGORIES:
+        shape = ShapeModel.pretrained(category)
+        figure = Figure(figsize=(14, 7), layout="constrained")
+        for axes, side, azimuth in zip(
+            figure.subplots(1, 2), ("front right", "back left"), (145.0, -35.0), strict=True
+        ):
+            turn = np.radians(azimuth)
+            towards = np.array([0.85 * np.sin(turn), 0.53, 0.85 * np.cos(turn)])
+            right = np.cross([0.0, 1.0, 0.0], towards)
+            right /= np.linalg.norm(right)
+            points = shape.mean[:-2] @ np.array([right, np.cross(towards, right)]).T
+            for line in shape.lines:
+                axes.plot(*points[list(line)].T, color="0.6", zorder=1)
+            axes.scatter(*points.T, s=18, zorder=2)
+            for label, name, place in zip(shape.ids, shape.names, points, strict=True):
+                axes.annotate(f"{label} {name}", place, (4, 4), textcoords="offset points", size=8)
+            axes.set_title(f"{category}, from the {side}")
+            axes.set_aspect("equal")
+            axes.margins(0.12)
+            axes.axis("off")
+        figure.savefig(DOCS / "concepts" / f"{category}.png", dpi=75)
+
+
 def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:
     """Write pictures of equal height side by side, scaled to a total width [px]."""
     row = np.hstack(pictures)
@@ -237,5 +265,5 @@ def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None
 
 if __name__ == "__main__":
     tyro.extras.subcommand_cli_from_dict(
-        {each.__name__: each for each in (overview, chairs, concepts)}
+        {each.__name__: each for each in (overview, chairs, concepts, categories)}
     )

@@ -284,9 +284,6 @@ SessionFiles = list[tuple[PhotoFile, Path]]
 def find_session_files(options: SessionOptions) -> SessionFiles:
     """Find the photos and name their files; raises InputError if files would collide."""
     image, given = options.image, options.observation
-    if options.model is None and options.shape is None:
-        fix = "give the CAD model, or a category, such as --shape chair"
-        raise InputError("neither a model nor a shape is given", where="MODEL", fix=fix)
     if options.model is None and options.keypoints is not None:
         raise InputError("given without a model", where="--keypoints", fix="give the model, too")
     paths = find_photos(image)

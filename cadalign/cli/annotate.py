@@ -50,6 +50,9 @@ class Annotate(SessionOptions):
         if [kind_of_file(path) for path in given] == [MESH, PHOTO]:
             what = f"{self.image} is a mesh and {self.model} is a photo: swap them"
             raise UsageError(what, where="PHOTO MODEL", fix="cadalign annotate PHOTO MODEL")
+        if self.model is None and self.shape is None:
+            fix = "give the CAD model, or a category, such as --shape chair"
+            raise UsageError("neither a model nor a shape is given", where="MODEL", fix=fix)
         listener = listen(self.port)
         with ExitStack() as opened:
             opened.enter_context(listener)

@@ -14,6 +14,7 @@ from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.geometry.alignment import (
     NOT_DETERMINED,
     NOT_DETERMINED_ROTATION_DEG,
+    bounds_corners,
     deviation_text,
     distance_deviation,
     why_open,
@@ -173,7 +174,7 @@ def object_of(
     result : cadalign.Result
     mesh : Mesh or path, optional
         Mesh of the model; by default the result's. It is warped to an estimated shape, see
-        `Result.mesh`.
+        `Result.mesh`. A learned shape without meshes has its box.
     photos : sequence of path or None
         The photos of the views; by default none.
     name : str
@@ -189,9 +190,15 @@ def object_of(
     if len(paths) != len(result.views):
         what = f"{len(paths)}, but the result has {len(result.views)} views"
         raise InputError(what, where="photos", fix="give one or None for each")
+    from scipy.spatial import ConvexHull
+
     from cadalign.render.overlay import drawable_mesh  # takes time to import
+    from cadalign.shapes.model import ShapeModel
 
     known = drawable_mesh(result, mesh)
+    if known is None and isinstance(result.model, ShapeModel) and not result.model.training:
+        corners = bounds_corners(*result.bounds)
+        known = Mesh(corners, ConvexHull(corners).simplices)
     if known is None:
         what = "there is no mesh of the model to write"
         raise InputError(what, where="mesh", fix="give one, or an observation with a `model`")

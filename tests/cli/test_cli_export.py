@@ -134,3 +134,13 @@ def test_results_of_learned_shapes_export_the_nearest_training_mesh(
     with pytest.raises(InputError, match="there is no mesh of the model to write"):
         found.export(tmp_path / "gone.obj")
     assert "the nearest training model is not drawn" in caplog.text
+
+
+def test_a_shape_without_meshes_is_exported_as_its_box(tmp_path: Path) -> None:
+    shape = ShapeModel.pretrained("chair")
+    pixels = CAMERA.project(POSE.apply(shape.mean[:-2]))
+    found = align(shape, View(CAMERA, pixels, ids=shape.names))
+    mesh = load_mesh(found.export(tmp_path / "box.obj"))
+    assert len(mesh.faces) == 12
+    ends = np.sort(mesh.vertices, axis=0)[[0, -1]]
+    np.testing.assert_allclose(ends, np.sort(found.box.corners, axis=0)[[0, -1]], atol=1e-5)

@@ -62,7 +62,9 @@ def halved(seen: UnseenObject) -> UnseenObject:
 
 
 def _errors(seen: UnseenObject, *, shape: cadalign.ShapeModel) -> Row:
-    return object_errors(ShapeEstimate.of(cadalign.align(shape, seen.view_of(shape))), seen)
+    return object_errors(
+        ShapeEstimate.from_result(cadalign.align(shape, seen.view_of(shape))), seen
+    )
 
 
 def _cell(rows: list[Row], count: int) -> str:

@@ -118,9 +118,8 @@ def category(state: Annotation, *, name: Text) -> ActionOutcome:
     before = len(state.marks.complete_pairs)
     state.exchange_shape(ObjectShape.open(Path(name)))
     kept = len(state.marks.complete_pairs)
-    lost = before - kept
     text = f"The object in this photo is a {name} now. {kept} of {before} pairs stay."
-    if lost:
+    if kept < before:
         text += " Choose keypoints for the others on the right."
     return ActionOutcome(message=f"{text} This cannot be undone.")
 

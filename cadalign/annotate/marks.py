@@ -20,7 +20,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
-from cadalign.shapes.pretrained import CATEGORIES
+from cadalign.shapes.pretrained import category_of
 
 _LONGEST = 1000  # history, in marks
 _LONGEST_NAME = 80
@@ -282,9 +282,7 @@ class ObjectShape:
     @property
     def category(self) -> str | None:
         """Name of the category whose shape comes with cadalign; None for a shape from a file."""
-        path = self.path
-        is_own = path is not None and path.name in CATEGORIES and not path.is_file()
-        return path.name if path is not None and is_own else None
+        return category_of(self.path)
 
     @classmethod
     def open(cls, path: Path | None) -> ObjectShape:

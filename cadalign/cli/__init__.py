@@ -81,9 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Imports create a million permanent objects. Rarer collections save 6 % of a start.
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
     try:
-        with protect_inputs(
-            ()
-        ):  # protects the models and textures that are read from being overwritten
+        with protect_inputs(()):  # models and textures that are read are not overwritten
             return int(_parse(given).run())
     except UsageError as error:
         sys.stderr.write(f"cadalign: {error}\n")

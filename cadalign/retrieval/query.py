@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 logger = logging.getLogger("cadalign")
 
 _LEAST_KEYPOINTS = 3
+_Table = tuple[tuple[str, str | int], ...]
+"""Pairs of a library's keypoint name and the shape's name or id."""
+_NO_TABLE: _Table = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +57,8 @@ class ObservationRetrieval:
         from cadalign.shapes.model import open_shape  # not needed for the commands' help
 
         library, shape = _library(self.library), open_shape(self.shape)
-        table = {} if self.keypoint_names is None else _read_table(self.keypoint_names)
-        return library, relabel(shape, library.names, table, where=str(self.library))
+        table = _NO_TABLE if self.keypoint_names is None else _read_table(self.keypoint_names)
+        return library, _shape_of_library(shape, library, table, str(self.library))
 
     def read(
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
@@ -67,7 +71,7 @@ class ObservationRetrieval:
     def resolve_ids(self, seen: Observation, where: str) -> Observation:
         """Add the library's semantic ids by keypoint names, unless the observation has ids.
 
-        With a shape, names and ids are the shape's.
+        With a shape, names may be the shape's; ids are always the library's.
 
         Raises DataError if there are no keypoints, or if they have neither ids nor names;
         InputError if the library lacks a name.
@@ -102,6 +106,12 @@ class ObservationRetrieval:
             shape=shape,
             workers=workers,
         )
+
+
+# Cached, since caches of the ranking and of estimates are by the shape.
+@lru_cache(4)
+def _shape_of_library(shape: ShapeModel, library: Library, table: _Table, where: str) -> ShapeModel:
+    return relabel(shape, library.names, dict(table), where=where)
 
 
 @once_per_file(4)
@@ -141,6 +151,7 @@ def relabel(
     return replace(shape, ids=ids)
 
 
-def _read_table(path: Path) -> dict[str, str | int]:
+@once_per_file(4)
+def _read_table(path: Path) -> _Table:
     with name_file(path):
-        return convert(read_json(path), dict[str, str | int])
+        return tuple(convert(read_json(path), dict[str, str | int]).items())

@@ -19,18 +19,24 @@ CATEGORIES = (
 _FOLDER = Path(__file__).parent
 
 
+def category_of(path: Path | None) -> str | None:
+    """Return the category that a path names; None for a file, even one of a category's name."""
+    if path is None or path.name not in CATEGORIES or path.is_file():
+        return None
+    return path.name
+
+
 def shape_path(given: Path) -> Path:
     """Return the shape file that a path means: itself, or the file of the category it names.
 
     An existing file is preferred, with a warning. Paths in observation files are relative to a
     folder, so only the name counts. Raises InputError for another name without a file.
     """
-    if given.name not in CATEGORIES:
-        if not given.suffix and not given.exists():
-            raise unknown_name("shape", given.name, CATEGORIES, where=str(given))
-        return given
-    if given.is_file():
+    if category := category_of(given):
+        return _FOLDER / f"{category}.shape"
+    if given.name in CATEGORIES:
         text = "%s: this file is used, not the shape of the category that comes with cadalign"
         logger.warning(text, given)
-        return given
-    return _FOLDER / f"{given.name}.shape"
+    elif not given.suffix and not given.exists():
+        raise unknown_name("shape", given.name, CATEGORIES, where=str(given))
+    return given

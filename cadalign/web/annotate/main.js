@@ -58,10 +58,6 @@ class App {
     window.addEventListener("focus", () => this.idle && this.state && this.api.refresh());
   }
 
-  async start() {
-    await this.open();
-  }
-
   /** Show the model of a photo: without a CAD model, each may have another. */
   async loadModel({ image, model }) {
     try {
@@ -211,4 +207,4 @@ class App {
 }
 
 window.annotator = new App();
-window.annotator.start();
+window.annotator.open();

@@ -14,7 +14,6 @@ from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, SKIPPED
 from cadalign.evaluation.summary import ALL, Summary, group_name
-from cadalign.report.runs import group_by_spec
 
 _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
@@ -71,33 +70,27 @@ class Headline:
 
 def headline_of(runs: Sequence[Run]) -> Headline:
     """Make the headline table of comparable runs."""
-    lines = []
+    spec, lines = spec_of(runs[0]), []
     for run in runs:
-        found = spec_of(run).summarize(run)
         # The summary over all groups comes first.
-        lines.append(sorted(found, key=lambda line: line.group.split(", ")[0] != ALL))
-    columns, notes = dict[str, Metric](), list[str]()
-    for spec, places in group_by_spec(runs):
-        own = [runs[k] for k in places]
-        of_spec = [line for k in places for line in lines[k]]
-        columns |= {each.key: each for each in spec.shown_columns(of_spec, own)}
-        notes.append(spec.note)
-    shown = tuple(columns.values())
+        found = sorted(spec.summarize(run), key=lambda line: line.group.split(", ")[0] != ALL)
+        lines.append(found)
+    shown = tuple(spec.shown_columns([line for each in lines for line in each], runs))
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
         rows += _mark_best(
             [HeadlineRow.from_summary(index, line, shown) for line in lines[index]], shown
         )
-        group = spec_of(run).group(run)
+        group = spec.group(run)
         failures += _reasons(index, run, group, FAILED)
         skipped += _reasons(index, run, group, SKIPPED)
     return Headline(
-        group=spec_of(runs[0]).group(runs[0]).heading,
+        group=spec.group(runs[0]).heading,
         columns=shown,
         rows=rows,
         failures=failures,
         skipped=skipped,
-        note=" ".join(filter(None, dict.fromkeys(notes))),
+        note=spec.note,
     )
 
 

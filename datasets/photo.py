@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
-from cadalign.datasets.records import RecordSet
-from cadalign.errors import CadalignError, DataError
+from cadalign.datasets.records import RecordSet, collect_error
+from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -204,21 +204,13 @@ def read_each(
     ``read`` converts the record at a position to an object, or to None to leave it out. ``where``
     is the place of the records, for messages.
     """
-    found: list[PhotoObject] = []
-    problems: list[DataError] = []
+    found, problems = list[PhotoObject](), dict[str, DataError]()
     for number, record in enumerate(records):
-        try:
+        place = f"{where}, object {number}"
+        with collect_error(place, problems), name_file(place):
             each = read(number, record)
-        except CadalignError as error:
-            place = f"{where}, object {number}"
-            if error.where:
-                has_file = error.where.startswith(where)
-                place = error.where if has_file else f"{place}: {error.where}"
-            problems.append(DataError(error.what, where=place, fix=error.fix))
-            continue
-        if each is not None:
-            found.append(each)
-    return tuple(found), tuple(problems)
+            found += [] if each is None else [each]
+    return tuple(found), tuple(problems.values())
 
 
 def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:

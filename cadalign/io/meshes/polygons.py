@@ -11,7 +11,7 @@ Turk, "The PLY polygon file format", 1994.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain
@@ -42,8 +42,8 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     corners, before = list[tuple[int, int]](), list[tuple[int, int]]()
     sizes, looks = list[int](), list[int]()
     libraries, numbers, look = list[str](), {"": 0}, 0  # numbers of materials, by name
-    for number, line in _lines(data):
-        key, _, body = line.partition(b" ")
+    for number, line in enumerate(data.replace(b"\t", b" ").splitlines(), start=1):
+        key, _, body = line.strip().partition(b" ")
         words = body.partition(b"#")[0].split()
         try:
             if key == b"v":
@@ -70,7 +70,7 @@ def read_obj(data: bytes, path: Path) -> Mesh:
                     "holds binary data, not the text of an OBJ file", f"line {number}"
                 )
         except (ValueError, IndexError):
-            shown = line[:60].decode("ascii", errors="replace")
+            shown = line.strip()[:60].decode("ascii", errors="replace")
             raise damage_error(f"cannot read {shown!r}", f"line {number}") from None
     if not sizes:
         what = f"the file has {len(vertices)} vertices, but no faces"
@@ -107,20 +107,6 @@ def read_obj(data: bytes, path: Path) -> Mesh:
         materials=tuple(known.get(name, plain) for name in names),
         source=str(path),
     )
-
-
-def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield stripped lines with their numbers; a backslash at the end continues a line.
-
-    Tabs become blanks, so a blank follows the keyword.
-    """
-    number = 0
-    text = (data + b"\n").replace(b"\t", b" ").replace(b"\r\n", b"\n").replace(b"\\\n", b" \v")
-    for line in text.splitlines():
-        number += 1 + line.count(b"\v")
-        line = line.strip()
-        if line:
-            yield number, line
 
 
 @lru_cache(maxsize=2**16)  # several faces share a corner

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
+from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
@@ -209,17 +210,10 @@ LinearArray = npt.NDArray[np.float32]
 ByteImage = npt.NDArray[np.uint8]
 
 
-def linear_from_srgb(encoded: LinearArray) -> LinearArray:
-    """Decode sRGB values (0 to 1, any shape) to linear light; float32."""
-    low = encoded / np.float32(12.92)
-    high = ((np.maximum(encoded, 0) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
-    return np.asarray(np.where(encoded <= 0.04045, low, high), dtype=np.float32)
-
-
-_DECODED = linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
+_DECODED: LinearArray = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 # sRGB bytes by the square root of linear light, which resolves dark values about as sRGB does.
 _STEPS = 1 << 14
-_LIMITS = linear_from_srgb((np.arange(255, dtype=np.float32) + np.float32(0.5)) / np.float32(255))
+_LIMITS = srgb_to_linear((np.arange(255) + 0.5) / 255)
 _ENCODED = np.searchsorted(_LIMITS, np.linspace(0, 1, _STEPS + 1) ** 2).astype(np.uint8)
 
 

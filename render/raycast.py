@@ -228,8 +228,6 @@ _TILE = 4
 _MAX_POINTS = 12_000
 # Distance of the rays' starts from the surface, in diagonals.
 _LIFT = 2e-3
-_SAME_SIDE = 0.85
-_FEW_ALIKE = 6
 _POINTS_AT_ONCE = 1 << 12
 # Evenly spread points of the unit sphere, (16, 8, 3). Each point of a tile takes every 16th, so
 # that it has points of all heights.
@@ -284,11 +282,14 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> LinearArra
 
     begins = range(0, len(inside), _POINTS_AT_ONCE)
     draw_in_threads(look, [slice(begin, begin + _POINTS_AT_ONCE) for begin in begins])
-    smooth, alike = _share_with_neighbours(sky, hit, depth, normal, posed.diagonal)
-    # A groove or bevel narrower than the grid is only hit here and there, and would look dashed.
-    filled = _fill_gaps(smooth, hit & (alike >= _FEW_ALIKE))
+    # The mean over a tile; beside the object it continues the border, which would else be bright.
+    total, count = (
+        cv2.boxFilter(each, -1, (_TILE, _TILE), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for each in (sky, hit.astype(np.float32))
+    )
+    smooth = np.where(count > 0, total / np.maximum(count, 1), np.float32(1))
     size = block.width, block.height
-    return np.asarray(cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _sky_directions(normal: LinearArray, tile: npt.NDArray[np.int64]) -> FloatArray:
@@ -296,45 +297,3 @@ def _sky_directions(normal: LinearArray, tile: npt.NDArray[np.int64]) -> FloatAr
     # Points of the unit sphere around the normal's tip are cosine-weighted directions.
     towards = normal[:, None] + _SPHERE[tile]
     return np.asarray(towards / np.linalg.norm(towards, axis=2, keepdims=True))
-
-
-def _share_with_neighbours(
-    sky: LinearArray,
-    hit: npt.NDArray[np.bool_],
-    depth: LinearArray,
-    normal: LinearArray,
-    diagonal: float,
-) -> tuple[LinearArray, LinearArray]:
-    """Average over those of the 4 x 4 neighbours on the same surface; returns their number too."""
-    rows, columns = hit.shape
-    before, after = _TILE // 2, _TILE - _TILE // 2 - 1
-    pad = ((before, after), (before, after))
-    wide_sky, wide_hit = np.pad(sky, pad), np.pad(hit, pad)
-    wide_depth = np.pad(depth, pad)
-    wide_normal = np.pad(normal, (*pad, (0, 0)))
-    total = np.zeros(hit.shape, dtype=np.float32)
-    weight = np.zeros(hit.shape, dtype=np.float32)
-    for down in range(_TILE):
-        for right in range(_TILE):
-            near = (slice(down, down + rows), slice(right, right + columns))
-            alike = np.einsum("rck,rck->rc", wide_normal[near], normal) > _SAME_SIDE
-            alike &= wide_hit[near]
-            alike &= np.abs(wide_depth[near] - depth) < 0.03 * diagonal
-            total += np.where(alike, wide_sky[near], 0)
-            weight += alike
-    mean = np.where(hit, total / np.maximum(weight, 1), 1)
-    return np.asarray(mean, dtype=np.float32), np.asarray(weight)
-
-
-def _fill_gaps(sky: LinearArray, known: npt.NDArray[np.bool_]) -> LinearArray:
-    """Replace unknown values by the average of known ones within two pixels."""
-    filled = np.where(known, sky, 0).astype(np.float32)
-    weight = known.astype(np.float32)
-    # The second pass fills the object's border, which would otherwise have a bright rim.
-    for _ in range(2):
-        total = cv2.boxFilter(filled, -1, (3, 3), normalize=False)
-        count = cv2.boxFilter(weight, -1, (3, 3), normalize=False)
-        empty = weight == 0
-        filled = np.where(empty, total / np.maximum(count, 1), filled)
-        weight = np.where(empty, count > 0, weight).astype(np.float32)
-    return np.where(weight > 0, filled, sky)

@@ -56,7 +56,7 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     placed = [
         (primitive, transform)
         for number, transform in _placements(document)
-        for primitive in _get_part(document, "meshes", number)["primitives"]
+        for primitive in document["meshes"][number]["primitives"]
         if _count_faces(document, primitive)
     ]
     if not placed:
@@ -91,8 +91,8 @@ class _GltfFile:
 
     def _view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
-        part = _get_part(self.document, "bufferViews", number)
-        announced = _get_part(self.document, "buffers", part["buffer"])["byteLength"]
+        part = self.document["bufferViews"][number]
+        announced = self.document["buffers"][part["buffer"]]["byteLength"]
         data = self._buffers[part["buffer"]]
         start, length = part.get("byteOffset", 0), part["byteLength"]
         if len(data) < announced or not 0 <= start <= start + length <= len(data):
@@ -102,7 +102,7 @@ class _GltfFile:
 
     def _array(self, number: int) -> npt.NDArray[Any]:
         """Read an accessor's array (n, width); normalized integers become fractions."""
-        accessor = _get_part(self.document, "accessors", number)
+        accessor = self.document["accessors"][number]
         if "sparse" in accessor or "bufferView" not in accessor:
             what = "sparse accessors, and accessors without data, are not supported"
             raise DataError(what, where=f"accessors[{number}]", fix="export the file without them")
@@ -134,11 +134,11 @@ class _GltfFile:
         return material, use
 
     def _texture(self, number: int) -> Texture | None:
-        part = _get_part(self.document, "textures", number)
+        part = self.document["textures"][number]
         source = part.get("extensions", {}).get("EXT_texture_webp", part).get("source")
         if source is None:
             return None
-        image = _get_part(self.document, "images", source)
+        image = self.document["images"][source]
         picture: Path | bytes = b""
         if "uri" not in image:
             picture = bytes(self._view(image["bufferView"]))
@@ -185,15 +185,6 @@ class _GltfFile:
         return np.asarray(turned * (1, -1) + (0, 1))
 
 
-def _get_part(document: _Part, name: str, number: int) -> _Part:
-    """Return a numbered part of one of the document's lists; raises DataError if missing."""
-    parts = document.get(name, [])
-    if not 0 <= number < len(parts):
-        raise damage_error(f"does not exist; there are {len(parts)} {name}", f"{name}[{number}]")
-    found: _Part = parts[number]
-    return found
-
-
 def _split_chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
     """Split a GLB file into its document and its binary part."""
     found = {b"JSON": b"", b"BIN\0": b""}
@@ -222,7 +213,7 @@ def _check(document: _Part) -> None:
 
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
     """Yield mesh numbers and transforms, in depth-first order of the scene's nodes."""
-    roots = _get_part(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    roots = document["scenes"][document.get("scene", 0)].get("nodes", [])
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
@@ -231,7 +222,7 @@ def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
             what = "the node has two parents, or is its own ancestor"
             raise DataError(what, where=f"nodes[{number}]", fix="nodes must form a tree")
         seen.add(number)
-        node = _get_part(document, "nodes", number)
+        node = document["nodes"][number]
         transform = parent @ _local_transform(node)
         if "mesh" in node:
             yield node["mesh"], transform
@@ -259,7 +250,7 @@ def _count_faces(document: _Part, primitive: _Part) -> int:
         raise DataError(what, where="meshes", fix="export single triangles")
     if position is None or mode != _TRIANGLES:
         return 0
-    count: int = _get_part(document, "accessors", primitive.get("indices", position))["count"]
+    count: int = document["accessors"][primitive.get("indices", position)]["count"]
     return count // 3
 
 

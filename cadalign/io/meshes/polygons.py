@@ -80,15 +80,11 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     named = np.array(corners)
     indices = np.where(named < 0, np.repeat(before, sizes, axis=0) + named, named)
     counts = len(vertices), len(coordinates) - 1
-    is_none = (named == 0) & [False, True]
-    wrong = np.argwhere(((indices < 1) & ~is_none) | (indices > counts))
+    wrong = np.flatnonzero(((indices < (1, 0)) | (indices > counts)).any(axis=1))
     if len(wrong):
-        corner, kind = wrong[0]
-        face = np.repeat(np.arange(len(sizes)), sizes)[corner]
-        what = f"{('vertex', 'texture coordinate')[kind]} {named[corner, kind]}"
-        raise damage_error(
-            f"face {face} (counted from 0) names {what}, but there are {counts[kind]}"
-        )
+        face = np.repeat(np.arange(len(sizes)), sizes)[wrong[0]]
+        what = f"face {face} (counted from 0) names {'/'.join(map(str, named[wrong[0]]))}, but"
+        raise damage_error(f"{what} there are {counts[0]} vertices, {counts[1]} coordinates")
     used, rows_of = np.unique(looks, return_inverse=True)
     names = np.array([*numbers], dtype=object)[used].tolist()
     known = load_materials(path, libraries, [name for name in names if name])

@@ -101,8 +101,6 @@ class Truth:
     camera: Camera | None = None
     """The camera that the pose was annotated with, if it is not the photo's. The pose fits the
     photo under this camera, but its translation and this focal length are only conventions."""
-    metres: float | None = None
-    """Length of one unit of the camera frame [m]; None if the size is unknown."""
 
     @property
     def rotation(self) -> FloatArray | None:

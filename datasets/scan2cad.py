@@ -205,7 +205,7 @@ def _object(
     return PhotoObject(
         object_id=object_id,
         category=name_of_synset(found.catid_cad),
-        truth=Truth(cam_from_model=cam_from_model, box=box, metres=1.0),
+        truth=Truth(cam_from_model=cam_from_model, box=box),
         keypoints=keypoints,
         model=CadModel(found.id_cad, mesh, points, bounds),
         symmetry=Symmetry.around(_UP, fold=_FOLDS[found.sym], offset=center),

@@ -176,17 +176,11 @@ class Canvas:
     ) -> tuple[int, int]:
         """Left and top of a plate in the corner where it covers the fewest pixels."""
         rows, columns = self.image.shape[:2]
-        corners = [
-            (left, top)
-            for top in (gap, rows - height - gap)
-            for left in (gap, columns - width - gap)
-        ]
-
-        def count_covered(corner: tuple[int, int]) -> int:
-            inside = (keep_clear >= corner) & (keep_clear <= np.add(corner, (width, height)))
-            return int(inside.all(axis=1).sum())
-
-        return min(corners, key=count_covered)
+        lefts, tops = (gap, columns - width - gap), (gap, rows - height - gap)
+        corners = np.array([[(left, top)] for top in tops for left in lefts])
+        inside = (keep_clear >= corners) & (keep_clear <= corners + (width, height))
+        ((left, top),) = corners[inside.all(axis=2).sum(axis=1).argmin()].tolist()
+        return left, top
 
     def _whole(self, points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
         """Convert pixels to OpenCV's fixed-point coordinates on the canvas."""

@@ -257,7 +257,6 @@ def check_symmetry(symmetry: object) -> None:
 
 
 def _direction(axis: FloatArray, where: str) -> FloatArray:
-    """The unit vector of an axis (3,)."""
     length = float(np.linalg.norm(axis))
     if not length > 0:
         raise InputError("the axis has no direction", where=where)

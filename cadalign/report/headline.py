@@ -13,7 +13,7 @@ from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, SKIPPED
-from cadalign.evaluation.summary import ALL, Summary, group_name
+from cadalign.evaluation.summary import ALL, group_name
 
 _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
@@ -33,12 +33,6 @@ class HeadlineRow:
     method: str
     cells: dict[str, float | None]
     best: tuple[str, ...] = ()
-
-    @classmethod
-    def from_summary(cls, run: int, line: Summary, columns: Sequence[Metric]) -> HeadlineRow:
-        """Convert a summary to a row, in the columns' units."""
-        cells = {column.key: column.shown(line.number(column.key)) for column in columns}
-        return cls(run, line.group, line.method, cells)
 
 
 Failure = dict[str, Any]
@@ -78,9 +72,11 @@ def headline_of(runs: Sequence[Run]) -> Headline:
     shown = tuple(spec.shown_columns([line for each in lines for line in each], runs))
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
-        rows += _mark_best(
-            [HeadlineRow.from_summary(index, line, shown) for line in lines[index]], shown
-        )
+        own = []
+        for line in lines[index]:
+            cells = {column.key: column.shown(line.number(column.key)) for column in shown}
+            own.append(HeadlineRow(index, line.group, line.method, cells))
+        rows += _mark_best(own, shown)
         group = spec.group(run)
         failures += _reasons(index, run, group, FAILED)
         skipped += _reasons(index, run, group, SKIPPED)

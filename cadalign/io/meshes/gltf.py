@@ -90,7 +90,6 @@ class _GltfFile:
         return read_bytes(self.path.parent / unquote(uri))
 
     def _view(self, number: int) -> memoryview:
-        """The bytes of a buffer view."""
         part = self.document["bufferViews"][number]
         announced = self.document["buffers"][part["buffer"]]["byteLength"]
         data = self._buffers[part["buffer"]]

@@ -187,7 +187,6 @@ def read_ply(data: bytes, path: Path) -> Mesh:
 
 
 def _header(text: str) -> tuple[str, list[_Element]]:
-    """Parse the header; returns the format and the elements."""
     form, elements = "", list[_Element]()
     for line in text.splitlines():
         match line.split():

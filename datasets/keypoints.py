@@ -5,7 +5,6 @@ Each model's entry is parsed alone, so a malformed entry does not affect other m
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
@@ -55,10 +54,6 @@ class Keypoints:
 
     def __len__(self) -> int:
         return len(self.xyz)
-
-    def __iter__(self) -> Iterator[tuple[int, FloatArray]]:
-        """Iterate over the (id, position (3,)) of each keypoint."""
-        return zip(self.ids.tolist(), self.xyz, strict=True)
 
     def locate(self, mesh: Mesh) -> FloatArray:
         """Compute the positions from faces and barycentric coordinates, (k, 3) float.

@@ -191,18 +191,13 @@ def _parse_points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
     if isinstance(value, _AxisKeypoints):
         if len(value.x) != len(value.y):
             raise DataError(f"{len(value.y)} values, but x has {len(value.x)}", where=f"{where}.y")
-        return np.column_stack([_floats(value.x), _floats(value.y)]), value.visible
-    flat = _floats(convert(value, list[float | None], where=where))
+        return np.array([value.x, value.y], dtype=float).T.copy(), value.visible  # NaN for None
+    flat = np.array(convert(value, list[float | None], where=where), dtype=float)
     if not len(flat) or len(flat) % 3:
         what = f"expected x, y and visibility or score of each keypoint, got {len(flat)} numbers"
         raise DataError(what, where=where, fix=_FIX)
     numbers = np.reshape(flat, (-1, 3))
     return np.ascontiguousarray(numbers[:, :2]), numbers[:, 2]
-
-
-def _floats(values: Any) -> FloatArray:
-    """Convert numbers to an array, with NaN for None."""
-    return np.array(values, dtype=float)
 
 
 def _number(entry: _Object, name: str, where: str) -> float | None:

@@ -217,12 +217,10 @@ class Mesh:
         """
         import trimesh
 
-        mesh, functions = (
-            trimesh.Trimesh(self.vertices, self.faces, process=False),
-            trimesh.triangles,
-        )
-        places, _, faces = trimesh.proximity.closest_point_naive(mesh, points)
-        weights = functions.points_to_barycentric(self.triangles[faces], places).clip(0)
+        functions: Any = trimesh  # which has no types
+        body = trimesh.Trimesh(self.vertices, self.faces, process=False)
+        places, _, faces = functions.proximity.closest_point_naive(body, points)
+        weights = functions.triangles.points_to_barycentric(self.triangles[faces], places).clip(0)
         return faces, weights / weights.sum(axis=1, keepdims=True)
 
     def __repr__(self) -> str:

@@ -44,7 +44,6 @@ def test_the_truth_is_pose_and_stretch_in_the_camera(tmp_path):
         np.testing.assert_allclose(truth.cam_from_model.translation, pose[:3, 3], atol=1e-6)
         np.testing.assert_allclose(truth.cam_from_model.scale, [1, 2, 0.5])
         np.testing.assert_allclose(truth.box.extents, [0.6, 1.2, 0.3])
-        assert truth.metres == 1.0
         assert (photo.camera.fx, photo.camera.cx, photo.camera.width) == (50, 31.5, 64)
         assert chair.category == "chair"
         assert chair.model.load_mesh().vertices.shape == (4, 3)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from trimesh.geometry import align_vectors
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import RenderError
+from cadalign.errors import RenderError, brief
 from cadalign.geometry.alignment import OPENGL_AXES, OPENGL_FLIP, Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Material
@@ -123,7 +123,7 @@ class GlContext:
             name = GL.glGetString(GL.GL_RENDERER)
         except Exception as error:  # PyOpenGL and ctypes raise errors of many types
             raise RenderError(
-                f"OpenGL does not start ({type(error).__name__}: {_beginning(error)})",
+                f"OpenGL does not start ({type(error).__name__}: {brief(error)})",
                 where="pyrender",
                 fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
             ) from None
@@ -158,7 +158,7 @@ class GlContext:
                 color, _ = self._renderer.render(scene, flags=self._flags)
             except Exception as error:  # PyOpenGL raises errors of many types
                 raise RenderError(
-                    f"OpenGL failed to draw ({type(error).__name__}: {_beginning(error)})",
+                    f"OpenGL failed to draw ({type(error).__name__}: {brief(error)})",
                     where="pyrender",
                     fix="use the ray-cast renderer",
                 ) from None
@@ -169,11 +169,6 @@ class GlContext:
 def shared_context() -> GlContext:
     """The context of this process; raises RenderError if OpenGL does not start."""
     return GlContext()
-
-
-def _beginning(error: Exception) -> str:
-    """Start of a message, on one line; PyOpenGL's have dozens of lines."""
-    return " ".join(str(error).split())[:160] or "no reason given"
 
 
 # Meshes, lights and the camera --------------------------------------------------------------------

@@ -119,7 +119,7 @@ def write_report(
         "runs": [_run_dict(run) for run in found],
         "methods": [method_dict(name, k) for k, name in enumerate(all_methods(found))],
         "metrics": [metric.page() for metric in metrics],
-        "headline": headline_of(found).to_dict(),
+        "headline": headline_of(found),
         "tables": None if table is None else table.to_dict(),
         "plots": [plot.to_dict() for plot in spec_of(found[0]).plots(found)],
         **media.to_dict(),

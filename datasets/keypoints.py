@@ -63,16 +63,22 @@ class Keypoints:
         return mesh.surface_points(self.face_index, self.barycentric)
 
 
-@dataclass(frozen=True, eq=False)
-class Circle:
+class Circle(ForeignDocument, eq=False):
     """A circle of equivalent keypoints, such as a bottle's rim."""
 
-    center: FloatArray
+    center: _Place
     """(3,), the centre [model units]."""
-    radius: float
+    radius: Annotated[float, Meta(ge=0, le=1e30)]
     """The radius [model units]."""
-    normal: FloatArray
+    normal: Point3
     """(3,), unit vector along the axis."""
+
+    def __post_init__(self) -> None:
+        if not any(self.normal):
+            raise InputError("the vector has length 0", where="normal")
+        axis = np.array(self.normal) / np.abs(self.normal).max()  # its square is finite
+        x, y, z = (axis / np.linalg.norm(axis)).tolist()
+        self.normal = x, y, z
 
 
 @dataclass(frozen=True)
@@ -116,16 +122,6 @@ class _Keypoint(ForeignDocument):
     mesh_info: _MeshInfo
 
 
-class _Circle(ForeignDocument):
-    center: _Place
-    radius: Annotated[float, Meta(ge=0, le=1e30)]
-    normal: Point3
-
-    def __post_init__(self) -> None:
-        if not any(self.normal):
-            raise InputError("the vector has length 0", where="normal")
-
-
 class _Reflection(ForeignDocument):
     kp_indexes: tuple[Count, Count]  # rows of the keypoints
 
@@ -133,7 +129,7 @@ class _Reflection(ForeignDocument):
 class _Rotation(ForeignDocument):
     kp_indexes: list[Count]
     is_circle: bool
-    circle: Any = None  # a _Circle if is_circle, else anything
+    circle: Any = None  # a Circle if is_circle, else anything
 
 
 class _Symmetries(ForeignDocument):
@@ -194,11 +190,7 @@ def _symmetries(read: _Symmetries) -> Symmetries:
     for row, item in enumerate(read.rotation):
         circle = None
         if item.is_circle:
-            found = convert(item.circle, _Circle, where=f"symmetries.rotation[{row}].circle")
-            normal = np.array(found.normal)
-            normal /= np.abs(normal).max()  # so that its square is finite
-            normal = _freeze(normal / np.linalg.norm(normal))
-            circle = Circle(_freeze(found.center), found.radius, normal)
+            circle = convert(item.circle, Circle, where=f"symmetries.rotation[{row}].circle")
         rotations.append(RotationalSymmetry(keypoints=tuple(item.kp_indexes), circle=circle))
     return Symmetries(tuple(item.kp_indexes for item in read.reflection), tuple(rotations))
 
@@ -269,10 +261,11 @@ def _axis_of_revolution(
     circles = [(r.keypoints, r.circle) for r in symmetries.rotations if r.circle is not None]
     if not circles:
         return None
-    first = circles[0][1].normal
-    cosine = np.cos(np.radians(_AXIS_TOLERANCE_DEG))
-    same = [(rows, c) for rows, c in circles if abs(float(c.normal @ first)) > cosine]
-    mean = np.sum([c.normal * np.sign(c.normal @ first) for _, c in same], axis=0)
+    normals = np.array([c.normal for _, c in circles])
+    cosines, cosine = normals @ normals[0], np.cos(np.radians(_AXIS_TOLERANCE_DEG))
+    rows = np.flatnonzero(np.abs(cosines) > cosine)
+    same = [circles[row] for row in rows]
+    mean = np.sign(cosines[rows]) @ normals[rows]
     axis = mean / np.linalg.norm(mean)
     nearest = int(np.argmax(np.abs(axis)))
     if abs(axis[nearest]) > cosine:  # ShapeNet's models are turned about their coordinate axes

@@ -14,7 +14,6 @@ from msgspec import Meta
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
@@ -54,13 +53,6 @@ class Keypoints:
 
     def __len__(self) -> int:
         return len(self.xyz)
-
-    def locate(self, mesh: Mesh) -> FloatArray:
-        """Compute the positions from faces and barycentric coordinates, (k, 3) float.
-
-        Raises InputError if a face index is not a face of the mesh.
-        """
-        return mesh.surface_points(self.face_index, self.barycentric)
 
 
 class Circle(ForeignDocument, eq=False):

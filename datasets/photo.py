@@ -72,21 +72,15 @@ class CadModel:
     bounds: FloatArray | None = None
     """(2, 3), lowest and highest corner of the annotated bounding box [model units], or None."""
 
-    def find_mesh(self) -> Mesh | None:
-        """Read the mesh; None if there is none. Raises DataError if it cannot be read."""
-        if isinstance(self.mesh, Path):
-            return load_mesh(self.mesh)
-        return self.mesh() if callable(self.mesh) else self.mesh
-
     def load_mesh(self) -> Mesh:
         """Read the mesh; raises DataError if it is missing or cannot be read."""
-        mesh = self.find_mesh()
+        mesh = self.mesh() if callable(self.mesh) else self.mesh
         if mesh is None:
             raise DataError("there is no mesh of this model", where=f"model {self.model_id}")
-        return mesh
+        return load_mesh(mesh) if isinstance(mesh, Path) else mesh
 
     def load_keypoints(self) -> NamedPoints | None:
-        """Read the named keypoints; None if there are none. Raises DataError as `find_mesh`."""
+        """Read the named keypoints; None if there are none. Raises DataError as `load_mesh`."""
         return self.keypoints() if callable(self.keypoints) else self.keypoints
 
 

@@ -147,7 +147,8 @@ def test_the_samples_of_one_scan_and_frames_beside_each_other(root, tmp_path):
     dataset = cadalign.datasets.open(samples.parent)
     assert isinstance(dataset, Scan2CAD)
     assert dataset.names == ("scene0000_00/7",)
-    assert dataset[0].objects[0].model.find_mesh() is None
+    with pytest.raises(DataError, match="there is no mesh of this model"):
+        dataset[0].objects[0].model.load_mesh()
 
 
 def test_folders_of_frames_and_models_may_be_links(root, tmp_path):

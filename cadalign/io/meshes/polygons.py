@@ -62,9 +62,9 @@ def read_obj(data: bytes, path: Path) -> Mesh:
                 # Negative indices count back from the current line.
                 before.append((len(vertices) + 1, len(coordinates)))
             elif key == b"usemtl":
-                look = numbers.setdefault(_text(body), len(numbers))
+                look = numbers.setdefault(body.decode(errors="replace").strip(), len(numbers))
             elif key == b"mtllib":
-                libraries.append(_text(body))
+                libraries.append(body.decode(errors="replace").strip())
             elif b"\0" in line:
                 raise damage_error(
                     "holds binary data, not the text of an OBJ file", f"line {number}"
@@ -113,10 +113,6 @@ def _parse_corner(word: bytes) -> tuple[int, int]:
     if len(values) > 2:
         raise ValueError(f"{word!r} is not a corner")
     return int(vertex), values[0] if values else 0
-
-
-def _text(body: bytes) -> str:
-    return body.decode("utf-8", errors="replace").strip()
 
 
 _HEADER_END = re.compile(rb"^end_header[ \t]*(?:\r?\n|\Z)", re.MULTILINE)

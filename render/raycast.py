@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.errors import InputError, RenderError
+from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
@@ -121,17 +121,6 @@ class Open3DRenderer(RaycastRenderer):
     """`RaycastRenderer` with the ray caster of Open3D."""
 
     name = "open3d"
-
-    def __init__(self, *, studio: Studio | None) -> None:
-        try:
-            import open3d  # noqa: F401
-        except (ImportError, OSError) as error:  # OSError: a system library is missing
-            raise RenderError(
-                f"Open3D cannot be imported ({error})",
-                where="open3d",
-                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
-            ) from None
-        super().__init__(studio=studio)
 
     def _caster(self, scene: Scene) -> RayCaster:
         return scene.open3d_caster

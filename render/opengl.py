@@ -118,15 +118,8 @@ class GlContext:
     """
 
     def __init__(self) -> None:
-        try:
-            self._renderer = pyrender.OffscreenRenderer(64, 64)  # makes its context current
-            name = GL.glGetString(GL.GL_RENDERER)
-        except Exception as error:  # PyOpenGL and ctypes raise errors of many types
-            raise RenderError(
-                f"OpenGL does not start ({type(error).__name__}: {brief(error)})",
-                where="pyrender",
-                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
-            ) from None
+        self._renderer = pyrender.OffscreenRenderer(64, 64)  # makes its context current
+        name = GL.glGetString(GL.GL_RENDERER)
         self.device = name.decode(errors="replace") if name else "unknown"
         self._flags = pyrender.RenderFlags.RGBA
         self._lock = threading.Lock()
@@ -167,7 +160,7 @@ class GlContext:
 
 @cache
 def shared_context() -> GlContext:
-    """The context of this process; raises RenderError if OpenGL does not start."""
+    """The context of this process."""
     return GlContext()
 
 

@@ -12,7 +12,7 @@ from importlib import import_module
 
 import numpy as np
 
-from cadalign.errors import CadalignError, RenderError, unknown_name
+from cadalign.errors import RenderError, brief, unknown_name
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -97,8 +97,7 @@ def report(name: str) -> None:
     try:
         result = _try(name)
     except Exception as error:  # the parent process reports any error
-        reason = error.what if isinstance(error, CadalignError) else str(error)
-        result = Probe(name, False, reason or type(error).__name__)
+        result = Probe(name, False, f"{type(error).__name__}: {brief(error)}")
     sys.stdout.write(f"\n{_MARK}{json.dumps(asdict(result))}\n")
     sys.stdout.flush()
 

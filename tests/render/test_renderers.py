@@ -318,7 +318,7 @@ def test_a_missing_egl_device_is_reported(monkeypatch):
     monkeypatch.setenv("EGL_DEVICE_ID", "77")
     found = probing.probe_renderer.__wrapped__("pyrender")
     assert not found.works
-    assert "OpenGL does not start (ValueError" in found.detail
+    assert "ValueError: " in found.detail
 
 
 def test_importing_the_package_loads_no_graphics():

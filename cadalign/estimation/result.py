@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, is_number
+from cadalign.arrays import BoolArray, FloatArray, IntArray, is_number
 from cadalign.errors import InputError, quote
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
@@ -266,6 +266,11 @@ class Result:
         Bounds of the keypoints if the model has no others.
         """
         return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+
+    @property
+    def lines(self) -> IntArray:
+        """Lines (k, 2) of the shape's skeleton, as rows of ``points_3d``; usually none."""
+        return np.array(getattr(self.model, "lines", ()), dtype=np.int64).reshape(-1, 2)
 
     @property
     def box(self) -> Box:

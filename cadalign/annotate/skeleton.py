@@ -19,7 +19,7 @@ from cadalign.annotate.model import (
     split_lines,
 )
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -83,13 +83,8 @@ def open_skeleton(shape: ObjectShape) -> MarkedModel:
     learned = shape.learned
     assert learned is not None
     registry = KeypointRegistry(fixed=True)
-    names = learned.names or [
-        label if isinstance(label, str) else f"keypoint {label}" for label in learned.ids
-    ]
-    for row, (label, name) in enumerate(zip(learned.ids, names, strict=True)):
-        x, y, z = learned.mean[row].tolist()
-        number = row if isinstance(label, str) else label
-        registry.add(ModelKeypoint(name, (x, y, z), number))
+    for point in ModelKeypoints.from_shape(learned).keypoints:
+        registry.add(point)
     return MarkedModel(None, Skeleton(learned), registry, Path())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.files import LastContent, keypoints_file, refuse_other_model
-from cadalign.annotate.marks import KeypointRegistry, ObjectShape, Pair
+from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import InputError
@@ -218,7 +217,7 @@ class ClickableModel:
 
 @dataclass(eq=False)
 class MarkedModel:
-    """A model that can be clicked on, its keypoints, and the file they are written to.
+    """A model that can be clicked on, its keypoints and their file, and the objects' shape.
 
     Without a ``path`` it is the skeleton of a learned shape, and nothing is written.
     """
@@ -226,6 +225,7 @@ class MarkedModel:
     path: Path | None
     cad: ClickableModel
     registry: KeypointRegistry
+    shape: ObjectShape
     keypoints_path: Path
     content: LastContent = field(default_factory=LastContent)  # of the keypoints file
 
@@ -234,9 +234,10 @@ class MarkedModel:
         """True for the skeleton of a learned shape."""
         return self.path is None
 
-    def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
-        """The model points of pairs that have one."""
-        return [self.registry[pair.keypoint] for pair in pairs if pair.keypoint is not None]
+    @property
+    def can_exchange(self) -> bool:
+        """True if the model is the skeleton of a category, which can be exchanged for another."""
+        return self.is_skeleton and self.shape.category is not None
 
     def write_keypoints(self, used: frozenset[int]) -> None:
         """Write all keypoints that are in use or from files; raises DataError on failure."""
@@ -269,4 +270,4 @@ def open_model(
             if source == own:
                 refuse_other_model(read.model, path, where=own)
             registry.merge(read.keypoints)
-    return MarkedModel(path, cad, registry, own, content)
+    return MarkedModel(path, cad, registry, shape, own, content)

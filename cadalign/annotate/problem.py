@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.marks import ObjectShape
+from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.arrays import FloatArray
 from cadalign.batch.observation_fit import model_of, views_of

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.marks import KeypointRegistry, ObjectShape
+from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
 from cadalign.annotate.model import (
     ClickableModel,
     Lines,
@@ -85,7 +85,7 @@ def open_skeleton(shape: ObjectShape) -> MarkedModel:
     registry = KeypointRegistry(fixed=True)
     for point in ModelKeypoints.from_shape(learned).keypoints:
         registry.add(point)
-    return MarkedModel(None, Skeleton(learned), registry, Path())
+    return MarkedModel(None, Skeleton(learned), registry, shape, Path())
 
 
 def next_row(

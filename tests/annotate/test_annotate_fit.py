@@ -10,7 +10,7 @@ import pytest
 from support.problems import problem_of
 
 from cadalign import Camera, fit
-from cadalign.annotate.marks import ObjectShape
+from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of
 from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors

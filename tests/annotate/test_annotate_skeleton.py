@@ -184,15 +184,19 @@ def test_another_category_keeps_pairs_of_equal_names(photo: Path) -> None:
     assert f"{len(shared)} of {len(shared) + len(own)} pairs stay" in outcome.message
     state = page_state(session, 0)
     assert state["model"]["key"] == "table"
-    assert not state["can_undo"]
     kept = {pair["name"] for pair in state["pairs"] if pair["name"]}
     assert kept == set(shared)
     halves = [pair for pair in state["pairs"] if pair["keypoint"] is None]
     assert sorted(pair["uv"][0] for pair in halves) == sorted(10.0 + ids[name] for name in own)
-    # The observation remembers its category.
+    # The observation remembers its category. Undo restores the one before, with all pairs.
     again = page_state(opened(photo), 0)
     assert again["model"]["key"] == "table"
     assert len(again["pairs"]) == len(state["pairs"])
+    for do, key, names in (("undo", "chair", {*shared, *own}), ("redo", "table", kept)):
+        perform(session, 0, {"do": do})
+        for state in (page_state(session, 0), page_state(opened(photo), 0)):
+            assert state["model"]["key"] == key
+            assert {pair["name"] for pair in state["pairs"] if pair["name"]} == names
     with pytest.raises(CadalignError, match="unknown category 'sofa'"):
         perform(session, 0, {"do": "category", "name": "sofa"})
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, expect
 from support.annotating import opened_page, place_of_pixel, wait
@@ -227,8 +228,27 @@ def test_input_without_model_or_shape_is_refused(
         opened(photo)
 
 
+@pytest.mark.parametrize("width", [1000, 1200, 1366])
+def test_pairs_without_a_model_take_one_line_each(
+    browser: Browser, photo: Path, width: int
+) -> None:
+    session = opened(photo)
+    mark_until(session, 8)
+    perform(session, 0, {"do": "category", "name": "table"})
+    with opened_page(browser, session, width=width, height=700) as page:
+        rows = page.locator(".pairs li")
+        heights = rows.evaluate_all("all => all.map((each) => each.offsetHeight)")
+        assert max(heights) < 34
+        names = "all => all.map((each) => [each.clientWidth, each.scrollWidth])"
+        widths = page.locator(".pairs .name").evaluate_all(names)
+        assert len(widths) >= 3
+        assert all(given >= needed for given, needed in widths)
+        choices = page.locator(".pairs select")
+        assert min(choices.evaluate_all("all => all.map((each) => each.offsetWidth)")) > 200
+
+
 @pytest.mark.long
-def test_a_chair_from_nothing_to_a_fitted_box(browser: Browser, photo: Path) -> None:
+def test_a_chair_from_nothing_to_an_exported_box(browser: Browser, photo: Path) -> None:
     """Clicks alone: the proposed keypoints, then an estimated one is taken, another dragged."""
     session, pixels = opened(photo, focal=900.0), chair_pixels()
     session.warm_up()
@@ -278,3 +298,8 @@ def test_a_chair_from_nothing_to_a_fitted_box(browser: Browser, photo: Path) -> 
     shape = ShapeModel.pretrained("chair")
     size = np.ptp(found.bounds, axis=0) * found.alignment.scale
     np.testing.assert_allclose(size, np.ptp(shape.mean[-2:], axis=0), rtol=0.3)
+    assert main(["export", str(out / "fit.json"), "--to", str(out / "chair.glb")]) == 0
+    scene = trimesh.load(out / "chair.glb")
+    place, name = scene.graph["model_0"]
+    lengths = np.ptp(scene.geometry[name].bounds, axis=0) * np.linalg.norm(place[:3, :3], axis=0)
+    np.testing.assert_allclose(lengths, size, rtol=1e-5)

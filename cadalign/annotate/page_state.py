@@ -96,7 +96,7 @@ def _shape(state: Annotation) -> dict[str, Any] | None:
     shape = state.model.shape
     if shape.learned is None:
         return None
-    known = {shape.id_of(point) for _, point in state.model.registry}
+    known = state.model.numbers
     return {
         "category": shape.learned.category,
         "missing": [label for label in shape.ids if label not in known],
@@ -150,27 +150,26 @@ def _alignment(state: Annotation, live: LiveAlignment, *, is_ready: bool) -> dic
 def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
     """Return box and edges of the model, and unmarked keypoints of a learned shape."""
     assert live.estimate is not None
-    assert live.wireframe is not None
-    result, shape = live.estimate.result, state.model.shape
+    result = live.estimate.result
     camera, alignment = result.camera, result.alignment
-    lines = live.wireframe.project(camera, alignment), box_lines(result.bounds, camera, alignment)
+    lines = live.lines, box_lines(result.bounds, camera, alignment)
     edges, box = (_round(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
     unmarked, regions = [], []
-    if shape.learned is not None:
-        registry, used = state.model.registry, state.marks.keypoints
-        free = {shape.id_of(point) for number, point in registry if number not in used}
+    if state.model.shape.learned is not None:
+        numbers, used = state.model.numbers, state.marks.keypoints
+        free = {label for label, number in numbers.items() if number not in used}
         in_camera = alignment.apply(result.points_3d)
         known = np.array([label in free for label in result.ids], dtype=bool)
         rows = np.flatnonzero(known & camera.sees(in_camera))
         pixels, covariances = camera.project(in_camera[rows]), result.points_cam_covariance
-        number_of: dict[Any, int] = {shape.id_of(point): number for number, point in registry}
         unmarked = [
-            {"keypoint": number_of[result.ids[row]], "uv": uv}
+            {"keypoint": numbers[result.ids[row]], "uv": uv}
             for row, uv in zip(rows, np.round(pixels, 1).tolist(), strict=True)
         ]
         if covariances is not None:
             places = camera.projected_covariances(in_camera[rows], covariances[rows])
-            regions = [_close(region) for region in confidence_regions(pixels, places)]
+            curves = confidence_regions(pixels, places)
+            regions = _round(np.concatenate([curves, curves[:, :1]], axis=1))
     return {"lines": edges, "box": box, "unmarked": unmarked, "regions": regions}
 
 
@@ -178,11 +177,6 @@ def _round(paths: FloatArray) -> list[list[float]]:
     """Round paths (k, n, 2) to 0.1 px, and flatten each to u1, v1, u2, v2, ..."""
     rounded: list[list[float]] = np.round(paths, 1).reshape(len(paths), -1).tolist()
     return rounded
-
-
-def _close(region: FloatArray) -> list[float]:
-    """Close a path (n, 2), so that it ends at its start."""
-    return _round(np.concatenate([region, region[:1]])[None])[0]
 
 
 def evidence_labels(observation: Observation) -> list[str]:

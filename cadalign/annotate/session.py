@@ -19,13 +19,12 @@ from cadalign.annotate.files import (
 )
 from cadalign.annotate.keypoints import ObjectShape, positions_of
 from cadalign.annotate.marks import History, Marks, Pixel
-from cadalign.annotate.model import Lines, MarkedModel, open_model
+from cadalign.annotate.model import MarkedModel, open_model
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS, ObservationFile
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
-from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors, warm_up
+from cadalign.annotate.problem import LiveEstimate, LiveProblem, warm_up
 from cadalign.annotate.skeleton import next_row, open_skeleton
-from cadalign.arrays import BoolArray
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
 from cadalign.estimation.result import Result
 from cadalign.io.observation import Observation, read_camera
@@ -43,8 +42,8 @@ class LiveAlignment:
     message: str = ""
     counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
     """Mask (n,) of the complete pairs that count."""
-    wireframe: Lines | None = None
-    """Lines of the model before the stretch, warped to a learned shape."""
+    lines: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    """Visible lines (k, 2, 2) of the object [px]."""
 
     @property
     def result(self) -> Result | None:
@@ -164,23 +163,16 @@ class Annotation:
         counts = np.array([pair in counting for pair in marks.complete_pairs], dtype=bool)
         if missing := missing_text(counts, shape, observation):
             return LiveAlignment(message=missing)
-        estimate, lines = self._estimate(observation), self.model.cad.wireframe
-        if shape.learned is not None:  # move known keypoints to their estimates
-            result = estimate.result
-            registry = self.model.registry
-            own: dict[Any, ModelKeypoint] = {shape.id_of(point): point for _, point in registry}
-            rows = [row for row, label in enumerate(result.ids) if label in own]
-            source = positions_of(own[result.ids[row]] for row in rows)
-            lines = lines.warp(source, result.points_3d[rows], result.bounds)
-        return LiveAlignment(estimate, "", counts, lines)
+        estimate = self._estimate(observation)
+        return LiveAlignment(estimate, "", counts, self.model.lines(estimate.result))
 
     def _estimate(self, observation: Observation) -> LiveEstimate:
         depends = replace(observation, draft=None).to_dict()
         key = json.dumps([depends, hash(self.marks.mask)])  # a mask's path may stay the same
         if self._estimated is None or self._estimated[0] != key:
-            mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
-            known = Priors(self.model.shape, mesh, likely, self.file.focal_prior)
-            self._estimated = key, LiveProblem.make(known, observation).estimate()
+            known = self.model.shape.learned, self.model.cad.scene.mesh
+            focal = self.photo.likely_focal.focal, self.file.focal_prior
+            self._estimated = key, LiveProblem.make(*known, observation, *focal).estimate()
         return self._estimated[1]
 
 
@@ -211,7 +203,7 @@ class Session:
             )
             warm_up(joint=joint)
             if not self.ended.is_set():
-                _ = self.model.cad.scene.caster, self.model.cad.wireframe
+                _ = self.model.cad.scene.caster, self.model.cad.creases
         finally:  # an error here occurs again, and is reported, when the user aligns
             self.ready = True
             with self.lock:

@@ -10,19 +10,16 @@ import math
 import sys
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.options import FitOptions, pixel_information
+from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
 from cadalign.geometry.alignment import Alignment, Uncertainty, extent, uncertainty_of
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
-
-if TYPE_CHECKING:
-    from cadalign.estimation.consensus import RobustSearch
 
 Kind = (
     Literal["mistake", "outlier", "misfit", "noise", "chance", "untested", "outside-image"]
@@ -187,7 +184,8 @@ class FittedKeypoints:
     cost: float | None = None
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = NO_STATS
-    search: RobustSearch | None = None  # with ransac
+    ransac: RansacOptions | None = None
+    doubt: Callable[[FloatArray, BoolArray], EstimateWarning | None] | None = None  # of inliers
     repeats: tuple[tuple[int, int], ...] = ()  # (row left out, row that it repeats)
 
     @property

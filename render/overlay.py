@@ -311,8 +311,8 @@ def draw_result(
     Confidence regions of keypoints that were not observed are drawn in the first view, or in all
     views of a rig. ``photo`` is as for `draw_overlay`, ``result`` a `cadalign.Result`, and
     ``number`` the index of the view. ``mesh`` (see `mesh_of`) and the box's ``bounds`` (2, 3) are
-    in the model frame before the stretch; by default the bounds are the result's. The contour of
-    ``mask`` (h, w) is drawn.
+    in the model frame before the stretch; by default the bounds are the result's. Without a mesh
+    the result's lines are drawn. The contour of ``mask`` (h, w) is drawn.
     """
     view = result.views[number]
     camera, alignment = view.camera, view.alignment

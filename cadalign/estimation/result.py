@@ -363,7 +363,7 @@ class Result:
             The photo; grey by default.
         mesh : Mesh, optional
             As for `mesh`, drawn shaded with its outline; default: the model's mesh, if it has one.
-            Without a mesh the box shows ``bounds``.
+            Without a mesh the box shows ``bounds``, and ``lines`` are drawn.
         view : int
             Number of the view to draw.
         axes : matplotlib.axes.Axes, optional

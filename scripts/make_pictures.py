@@ -104,17 +104,14 @@ def chairs(*, files: Path | None = None) -> None:
 
 def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
     """Render a photo and return its visible keypoints with the other model's points."""
-    scene = Scene(seen.load_mesh())
-    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
-    write_image(photo, still(scene))
-    visible = visible_keypoints(scene, seen.keypoints.xyz, CHAIR_CAMERA, pose)
-    in_photo = seen.keypoints.xyz[visible]
+    picture, view = _view_of(seen)
+    write_image(photo, picture)
     shared, rows, model_rows = np.intersect1d(
-        seen.keypoints.ids[visible], model.keypoints.ids, return_indices=True
+        view.keypoint_ids, model.keypoints.ids, return_indices=True
     )
     return Observation(
         points_3d=model.keypoints.xyz[model_rows],
-        points_2d=CHAIR_CAMERA.project(pose.apply(in_photo[rows])),
+        points_2d=view.pixels[rows],
         camera=CHAIR_CAMERA,
         ids=shared,
         image=photo,
@@ -123,9 +120,9 @@ def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observa
     )
 
 
-def still(scene: Scene) -> ByteImage:
-    """Render a chair, (h, w, 3) uint8."""
-    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
+def still(scene: Scene, view: Angles = CHAIR_VIEW) -> ByteImage:
+    """Render a model, (h, w, 3) uint8."""
+    pose = pose_in_view(scene, CHAIR_CAMERA, view)
     frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
     return frame.composite(PHOTO_GROUND)
 
@@ -150,7 +147,8 @@ def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
     """True and estimated box from the front, where they agree, and from the side."""
     scene, xyz = Scene(model.load_mesh()), model.keypoints.xyz
     front = xyz[np.argsort(xyz[:, 2])[:4]]  # in one plane
-    poses = [pose_in_view(scene, CHAIR_CAMERA, Angles(azimuth=a, elevation=4.0)) for a in (0, 70)]
+    views = [Angles(azimuth=azimuth, elevation=4.0) for azimuth in (0, 70)]
+    poses = [pose_in_view(scene, CHAIR_CAMERA, view) for view in views]
     pixels = CHAIR_CAMERA.project(poses[0].apply(front))
     pixels += np.random.default_rng(3).normal(0, 1.5, pixels.shape)
     shallow = np.array([1.0, 1.0, 0.5])  # of a model half as deep as the object
@@ -164,18 +162,18 @@ def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
     )
     return [
         draw_overlay(
-            RaycastRenderer().render(scene, CHAIR_CAMERA, true, samples=16).composite(PHOTO_GROUND),
+            still(scene, view),
             CHAIR_CAMERA,
             gt_box=Box.from_model(scene.bounds, true),
             est_box=Box.from_model(scene.bounds * shallow, estimate),
             observed=pixels if true is poses[0] else None,
             legend=False,
         )
-        for true, estimate in zip(poses, (result.alignment, seen), strict=True)
+        for view, true, estimate in zip(views, poses, (result.alignment, seen), strict=True)
     ]
 
 
-def _view_of(model: AnnotatedModel, *, noise_px: float) -> tuple[ByteImage, View]:
+def _view_of(model: AnnotatedModel, *, noise_px: float = 0.0) -> tuple[ByteImage, View]:
     """A rendered photo of a chair, and its visible keypoints."""
     scene = Scene(model.load_mesh())
     pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
@@ -183,7 +181,7 @@ def _view_of(model: AnnotatedModel, *, noise_px: float) -> tuple[ByteImage, View
     pixels = CHAIR_CAMERA.project(pose.apply(model.keypoints.xyz[visible]))
     pixels += np.random.default_rng(0).normal(0, noise_px, pixels.shape)
     return still(scene), View(
-        CHAIR_CAMERA, pixels, ids=model.keypoints.ids[visible], sigma=noise_px
+        CHAIR_CAMERA, pixels, ids=model.keypoints.ids[visible], sigma=noise_px or None
     )
 
 
@@ -197,15 +195,11 @@ def _regions(dataset: KeypointNet) -> list[ByteImage]:
 
 def _equal_poses(model: AnnotatedModel) -> list[ByteImage]:
     """A bottle at three rotations about its axis, with its box."""
-    scene = Scene(model.load_mesh())
-    pictures = []
+    scene, pictures = Scene(model.load_mesh()), []
     for degrees in (0, 40, 90):
-        pose = pose_in_view(scene, CHAIR_CAMERA, Angles(azimuth=degrees, elevation=24.0))
-        frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
-        box = Box.from_model(scene.bounds, pose)
-        pictures.append(
-            draw_overlay(frame.composite(PHOTO_GROUND), CHAIR_CAMERA, est_box=box, legend=False)
-        )
+        view = Angles(azimuth=degrees, elevation=24.0)
+        box = Box.from_model(scene.bounds, pose_in_view(scene, CHAIR_CAMERA, view))
+        pictures.append(draw_overlay(still(scene, view), CHAIR_CAMERA, est_box=box, legend=False))
     return pictures
 
 

@@ -128,10 +128,9 @@ def diagnose_fit(
 
     Messages name keypoints by ``labels``, by default their rows.
     """
-    search, options, counted = fitted.search, fitted.options, fitted.is_counted
-    first = None if search is None else search.ransac
-    passes = [(np.isfinite(fitted.residuals).all(axis=1) & counted, first)]
-    if search and options.sigma is not None and fitted.fisher_covariance is not None:
+    given, options, counted = fitted.ransac, fitted.options, fitted.is_counted
+    passes = [(np.isfinite(fitted.residuals).all(axis=1) & counted, given)]
+    if given and options.sigma is not None and fitted.fisher_covariance is not None:
         passes.append((fitted.inliers, None))
     for kept, ransac in passes:
         # No samples are needed if all keypoints agree.

@@ -78,7 +78,7 @@ def take_proposed(session: Session) -> str:
 
 
 def mark_until(session: Session, count: int) -> None:
-    """Mark or skip what is proposed, each keypoint once at most, until ``count`` pairs are there."""
+    """Mark or skip what is proposed until ``count`` pairs are there, each keypoint once at most."""
     for _ in page_state(session, 0)["keypoints"]:
         if len(page_state(session, 0)["pairs"]) < count:
             take_proposed(session)

@@ -83,9 +83,9 @@ def chairs() -> None:
     write_row(DOCS / "other_chair.png", [image, still(Scene(mesh)), aligned], width=1500)
 
 
-def still(scene: Scene) -> ByteImage:
-    """Render a chair, (h, w, 3) uint8."""
-    pose = pose_in_view(scene, CAMERA, VIEW)
+def still(scene: Scene, view: Angles = VIEW) -> ByteImage:
+    """Render a model, (h, w, 3) uint8."""
+    pose = pose_in_view(scene, CAMERA, view)
     return RaycastRenderer().render(scene, CAMERA, pose, samples=16).composite(GROUND)
 
 
@@ -154,13 +154,11 @@ def _regions(dataset: KeypointNet) -> list[ByteImage]:
 
 def _equal_poses(model: AnnotatedModel) -> list[ByteImage]:
     """A bottle at three rotations about its axis, with its box."""
-    scene = Scene(model.load_mesh())
-    pictures = []
+    scene, pictures = Scene(model.load_mesh()), []
     for degrees in (0, 40, 90):
-        pose = pose_in_view(scene, CAMERA, Angles(azimuth=degrees, elevation=24.0))
-        frame = RaycastRenderer().render(scene, CAMERA, pose, samples=16)
-        box = Box.from_model(scene.bounds, pose)
-        pictures.append(draw_overlay(frame.composite(GROUND), CAMERA, est_box=box, legend=False))
+        view = Angles(azimuth=degrees, elevation=24.0)
+        box = Box.from_model(scene.bounds, pose_in_view(scene, CAMERA, view))
+        pictures.append(draw_overlay(still(scene, view), CAMERA, est_box=box, legend=False))
     return pictures
 
 

@@ -1,7 +1,7 @@
 """Make the pictures of the documentation.
 
 python scripts/make_pictures.py overview
-python scripts/make_pictures.py chairs --files chairs     # also keeps the example's files
+python scripts/make_pictures.py chairs
 python scripts/make_pictures.py concepts
 """
 
@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 import tyro
 
-from cadalign import Alignment, Box, Camera, Library, Observation, ShapeModel, View, align, fit
-from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
+from cadalign import Alignment, Box, Library, Observation, ShapeModel, View, align, fit
+from cadalign.cli.example import CAMERA, GROUND, VIEW, write_example
+from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.io.images import read_image, write_image
+from cadalign.io.meshes.files import load_mesh
 from cadalign.render import (
     Angles,
     RaycastRenderer,
@@ -36,9 +38,6 @@ from cadalign.shapes.warp import warp_mesh
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
-CHAIR_CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
-CHAIR_VIEW = Angles(azimuth=143.0, elevation=24.0)
-PHOTO_GROUND = (206, 208, 212)
 
 
 def overview() -> None:
@@ -67,67 +66,27 @@ def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
     )
 
 
-def chairs(*, files: Path | None = None) -> None:
-    """Make the README's worked example: align a sample chair to a rendered photo of another one.
-
-    Keypoints correspond by their semantic ids.
-
-    Parameters
-    ----------
-    files : Path, optional
-        Folder for the photo, the observation, the model's keypoints and the picture. By default
-        only docs/other_chair.png is kept.
-    """
+def chairs() -> None:
+    """Make the picture of the worked example: a sample chair aligned to a photo of another one."""
     with tempfile.TemporaryDirectory() as folder:
-        root = files or Path(folder)
-        dataset = KeypointNet(write_sample_dataset(root / "sample"))
-        seen, own = (dataset["chair", f"sample_chair_{name}"] for name in ("006", "000"))
-        photo = root / "photo.png"
-        observation = observe(seen, own, photo)
-        observation.save(root / "photo.json")
-        ModelKeypoints.from_model(own).save(root / f"{own.model_id}.keypoints.json")
-        result = fit(observation.points_3d, observation.points_2d, observation.camera, sigma=None)
-        print(result)
-
-        scene = Scene(own.load_mesh())
-        image = read_image(photo, CHAIR_CAMERA)
-        aligned = draw_overlay(
-            overlay_model(image, CHAIR_CAMERA, scene, result.alignment),
-            CHAIR_CAMERA,
-            observed=observation.points_2d,
-            reprojected=CHAIR_CAMERA.project(result.alignment.apply(observation.points_3d)),
-            legend=False,
-        )
-        out = (files or DOCS) / "other_chair.png"
-        write_row(out, [image, still(scene), aligned], width=1500)
-
-
-def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
-    """Render a photo and return its visible keypoints with the other model's points."""
-    scene = Scene(seen.load_mesh())
-    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
-    write_image(photo, still(scene))
-    visible = visible_keypoints(scene, seen.keypoints.xyz, CHAIR_CAMERA, pose)
-    in_photo = seen.keypoints.xyz[visible]
-    shared, rows, model_rows = np.intersect1d(
-        seen.keypoints.ids[visible], model.keypoints.ids, return_indices=True
+        write_example(Path(folder))
+        observation = Observation.load(Path(folder, "clicks.json"))
+        image, mesh = read_image(Path(folder, "photo.jpg"), CAMERA), load_mesh(observation.model)
+    result = fit(observation.points_3d, observation.points_2d, CAMERA, sigma=None)
+    aligned = draw_overlay(
+        overlay_model(image, CAMERA, Scene(mesh), result.alignment),
+        CAMERA,
+        observed=observation.points_2d,
+        reprojected=CAMERA.project(result.alignment.apply(observation.points_3d)),
+        legend=False,
     )
-    return Observation(
-        points_3d=model.keypoints.xyz[model_rows],
-        points_2d=CHAIR_CAMERA.project(pose.apply(in_photo[rows])),
-        camera=CHAIR_CAMERA,
-        ids=shared,
-        image=photo,
-        model=model.mesh_path,
-        fit_options={"sigma": None},  # the chairs differ by more than the pixels' noise
-    )
+    write_row(DOCS / "other_chair.png", [image, still(Scene(mesh)), aligned], width=1500)
 
 
-def still(scene: Scene) -> ByteImage:
-    """Render a chair, (h, w, 3) uint8."""
-    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
-    frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
-    return frame.composite(PHOTO_GROUND)
+def still(scene: Scene, view: Angles = VIEW) -> ByteImage:
+    """Render a model, (h, w, 3) uint8."""
+    pose = pose_in_view(scene, CAMERA, view)
+    return RaycastRenderer().render(scene, CAMERA, pose, samples=16).composite(GROUND)
 
 
 def concepts() -> None:
@@ -150,11 +109,11 @@ def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
     """True and estimated box from the front, where they agree, and from the side."""
     scene, xyz = Scene(model.load_mesh()), model.keypoints.xyz
     front = xyz[np.argsort(xyz[:, 2])[:4]]  # in one plane
-    poses = [pose_in_view(scene, CHAIR_CAMERA, Angles(azimuth=a, elevation=4.0)) for a in (0, 70)]
-    pixels = CHAIR_CAMERA.project(poses[0].apply(front))
+    poses = [pose_in_view(scene, CAMERA, Angles(azimuth=a, elevation=4.0)) for a in (0, 70)]
+    pixels = CAMERA.project(poses[0].apply(front))
     pixels += np.random.default_rng(3).normal(0, 1.5, pixels.shape)
     shallow = np.array([1.0, 1.0, 0.5])  # of a model half as deep as the object
-    result = fit(front * shallow, pixels, CHAIR_CAMERA, stretch_sigma=0.3)
+    result = fit(front * shallow, pixels, CAMERA, stretch_sigma=0.3)
     turn = poses[1].rotation @ poses[0].rotation.T
     shift = poses[1].translation - turn @ poses[0].translation
     seen = Alignment(
@@ -164,8 +123,8 @@ def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
     )
     return [
         draw_overlay(
-            RaycastRenderer().render(scene, CHAIR_CAMERA, true, samples=16).composite(PHOTO_GROUND),
-            CHAIR_CAMERA,
+            RaycastRenderer().render(scene, CAMERA, true, samples=16).composite(GROUND),
+            CAMERA,
             gt_box=Box.from_model(scene.bounds, true),
             est_box=Box.from_model(scene.bounds * shallow, estimate),
             observed=pixels if true is poses[0] else None,
@@ -178,34 +137,28 @@ def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
 def _view_of(model: AnnotatedModel, *, noise_px: float) -> tuple[ByteImage, View]:
     """A rendered photo of a chair, and its visible keypoints."""
     scene = Scene(model.load_mesh())
-    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
-    visible = visible_keypoints(scene, model.keypoints.xyz, CHAIR_CAMERA, pose)
-    pixels = CHAIR_CAMERA.project(pose.apply(model.keypoints.xyz[visible]))
+    pose = pose_in_view(scene, CAMERA, VIEW)
+    visible = visible_keypoints(scene, model.keypoints.xyz, CAMERA, pose)
+    pixels = CAMERA.project(pose.apply(model.keypoints.xyz[visible]))
     pixels += np.random.default_rng(0).normal(0, noise_px, pixels.shape)
-    return still(scene), View(
-        CHAIR_CAMERA, pixels, ids=model.keypoints.ids[visible], sigma=noise_px
-    )
+    return still(scene), View(CAMERA, pixels, ids=model.keypoints.ids[visible], sigma=noise_px)
 
 
 def _regions(dataset: KeypointNet) -> list[ByteImage]:
     """95 % regions of a learned shape's keypoints, from all visible keypoints and from four."""
     shape = ShapeModel.from_dataset(dataset, "chair", split="train")
     photo, view = _view_of(dataset.subset(split="test")["chair"][0], noise_px=2.0)
-    few = View(CHAIR_CAMERA, view.pixels[:4], ids=view.keypoint_ids[:4], sigma=2.0)
+    few = View(CAMERA, view.pixels[:4], ids=view.keypoint_ids[:4], sigma=2.0)
     return [draw_result(photo, align(shape, each)) for each in (view, few)]
 
 
 def _equal_poses(model: AnnotatedModel) -> list[ByteImage]:
     """A bottle at three rotations about its axis, with its box."""
-    scene = Scene(model.load_mesh())
-    pictures = []
+    scene, pictures = Scene(model.load_mesh()), []
     for degrees in (0, 40, 90):
-        pose = pose_in_view(scene, CHAIR_CAMERA, Angles(azimuth=degrees, elevation=24.0))
-        frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
-        box = Box.from_model(scene.bounds, pose)
-        pictures.append(
-            draw_overlay(frame.composite(PHOTO_GROUND), CHAIR_CAMERA, est_box=box, legend=False)
-        )
+        view = Angles(azimuth=degrees, elevation=24.0)
+        box = Box.from_model(scene.bounds, pose_in_view(scene, CAMERA, view))
+        pictures.append(draw_overlay(still(scene, view), CAMERA, est_box=box, legend=False))
     return pictures
 
 
@@ -225,7 +178,7 @@ def _matches(dataset: KeypointNet) -> list[ByteImage]:
     """A photo of a chair, and overlays of the three best matches."""
     photo, view = _view_of(dataset["chair", "sample_chair_006"], noise_px=1.0)
     library = Library.from_models(dataset["chair"])
-    matches = library.retrieve(view.pixels, view.keypoint_ids, CHAIR_CAMERA, top=3)
+    matches = library.retrieve(view.pixels, view.keypoint_ids, CAMERA, top=3)
     return [photo, *(draw_match(photo, match) for match in matches)]
 
 

@@ -106,7 +106,9 @@ def test_wheel_is_typed_and_brings_the_command(wheel: zipfile.ZipFile) -> None:
 
 def test_import_brings_nothing_heavy() -> None:
     code = "import json, sys, cadalign; print(json.dumps(sorted(sys.modules)))"
-    assert HEAVY & {name.split(".")[0] for name in json.loads(python(code))} == set()
+    loaded = json.loads(python(code))
+    assert HEAVY & {name.split(".")[0] for name in loaded} == set()
+    assert not any(name.startswith("cadalign.shapes") for name in loaded)
 
 
 def test_command_line_brings_nothing_heavy_before_it_runs() -> None:

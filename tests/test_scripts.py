@@ -14,7 +14,6 @@ from benchmarks import section
 from benchmarks.evidence import SeenObject, align_with, draw_object, move
 from benchmarks.section import BenchmarkData, Row, Tables
 
-from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -55,20 +54,6 @@ def test_every_script_starts(
     shown = capsys.readouterr().out
     assert "usage: " in shown
     assert ("--quick" in shown) == (script.stem == "reproduce_paper")
-
-
-@pytest.mark.long
-def test_the_worked_photo_aligns_as_its_page_says(
-    tmp_path: Path, run: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    files, script = tmp_path / "chairs", ROOT / "scripts" / "make_pictures.py"
-    assert run(script, "chairs", "--files", str(files)) == 0
-    assert (files / "other_chair.png").is_file()
-    assert main(["fit", str(files / "photo.json"), "--out", str(tmp_path / "fit")]) == 0
-    page = (ROOT / "docs" / "photo_to_glb.md").read_text(encoding="utf-8")
-    printed = capsys.readouterr().out
-    for line in page.partition("```text\n")[2].partition("```")[0].splitlines():
-        assert line in printed
 
 
 def toy(given: BenchmarkData) -> Tables:

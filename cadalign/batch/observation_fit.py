@@ -318,14 +318,14 @@ def views_of(
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
-    """Return the shape's ids of an image's keypoints, by their names if the shape has all of them.
+    """Return the shape's ids of an image's keypoints, by their names if the shape has some of them.
 
     `views_of` describes the errors.
     """
     if not len(image.points_2d):
         return ()
     of_shape = shape.names or (shape.ids if isinstance(shape.ids[0], str) else ())
-    by_name = image.names is not None and (image.ids is None or {*image.names} <= {*of_shape})
+    by_name = image.names is not None and (image.ids is None or bool({*image.names} & {*of_shape}))
     field = "name" if of_shape and (by_name or of_shape is shape.ids) else "semantic_id"
     given = image.names if field == "name" else image.ids
     if given is None:

@@ -31,7 +31,7 @@ class Annotate(SessionOptions):
 
     image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTO")]
     """A photo, or a folder of photos."""
-    model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = None
+    model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[MODEL]")] = None
     """The model: an OBJ, PLY, GLB, glTF, STL or OFF file. With --shape it may be left out: the
     keypoints of the shape are marked in the photo alone, one after the other."""
     port: int = 0

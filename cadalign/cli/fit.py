@@ -165,9 +165,10 @@ class Export:
                     what = f"its {len(model.ids)} keypoints are not the fit's {len(result.ids)}"
                     raise DataError(what, where=str(seen.shape), fix="fit the observation again")
                 result = replace(result, model=model)
+            mesh = mesh_of(seen, result)
             exported = object_of(
-                result,
-                mesh=mesh_of(seen, result),
+                result if mesh is None else replace(result, model=None),  # it is warped already
+                mesh=mesh,
                 photos=[view.image for view in seen.views],
                 name="model" if seen.model is None else seen.model.stem,
             )

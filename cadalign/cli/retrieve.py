@@ -161,7 +161,7 @@ class LibraryBuild:
         own = keypoint_files(self.root) if self.root.is_dir() else []
         files: Iterable[Path] = own
         dataset, total = None, len(own)
-        if own:
+        if own or (self.root.is_dir() and not (self.root / "annotations").is_dir()):
             with name_flags(self):
                 unused = {"categories", "split", "shapenet"}
                 refuse_unused(self, unused, "on a folder of own models")

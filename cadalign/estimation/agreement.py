@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -40,7 +40,7 @@ _UNLIKELY_POSE_COST = 8.0  # -2 log probability that an object is not upright, o
 _MOST_EXCESS = 1.3  # ratio of squares to expected squares that an uncertain shape may have
 _LEAST_FIT = 0.8  # least ratio of squares to their expectation for correct data
 _GAIN_RATIO = 2.0  # least ratio of squares with a mistake to squares without, at unknown noise
-_MOST_CORRECTED = 1.6  # largest corrected residuals of an uncertain shape [sigma]
+MOST_CORRECTED = 1.6  # largest corrected residuals of an uncertain shape [sigma]
 _LEAST_RATIO = 1.7  # of residuals before and after the correction
 _LARGE_RATIO = 5.0  # the same if sigma is wrong
 _MORE_INLIERS_GAIN = 2.0  # gain of -2 log likelihood if more keypoints agree
@@ -58,7 +58,7 @@ class Rule(NamedTuple):
     """A cause of large residuals, how to correct it, and the ``clause`` of its text.
 
     A view corrected to None is left out. The corrected estimate must gain ``gain`` of -2 log
-    likelihood, and ``price`` for each equation that it lacks.
+    likelihood, and ``price`` for each equation that it lacks; its residuals are at most ``most``.
     """
 
     kind: Kind
@@ -68,6 +68,7 @@ class Rule(NamedTuple):
     changes: Mapping[str, Any] = {}
     gain: float = LEAST_GAIN
     price: float = 0.0
+    most: float = math.inf  # [sigma]
 
 
 class Agreement(NamedTuple):
@@ -274,6 +275,8 @@ class DiagnosisCase:
         gain, is_piece = self.gain(rule, found, given), rule.price > 0
         if is_piece and not self.is_exact and not self._may_be_wrong(found, given):
             return False
+        if found.ratio > rule.most:
+            return False
         is_robust = self.ransac is not None and not is_piece
         if is_robust and (self.is_exact or given.inliers < given.keypoints):
             more = found.inliers > given.inliers or found.inliers == found.keypoints
@@ -294,7 +297,7 @@ class DiagnosisCase:
         fits = self.has_chance(found)
         if rejected or "ransac" in rule.changes:
             return fits and 0 < rejected <= _MOST_REJECTED * found.keypoints
-        is_small = found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)
+        is_small = found.ratio < min(MOST_CORRECTED, given.ratio / _LEAST_RATIO)
         return fits or is_small or found.ratio < given.ratio / _LARGE_RATIO
 
 
@@ -354,6 +357,7 @@ def _wrong_keypoints(
             wrong[view.number] = tuple(cast("list[int]", numbers))
             where = f"views[{view.number}]: " if len(case.views) > 1 else ""
             called = [names[row] for row in rows]
+            called = [*shape_names(case.model, called)] or called
             if case.labels:
                 called = [case.labels[each] for each in wrong[view.number]]
             of_each = zip(map(quote, called), errors[rows].tolist(), strict=True)
@@ -361,6 +365,13 @@ def _wrong_keypoints(
     total = sum(map(len, wrong.values()))
     text = f"{'keypoint' if total == 1 else 'keypoints'} {'; '.join(texts)}"
     return (text, None, ()) if all_agree or len(wrong) > 1 else (text, *next(iter(wrong.items())))
+
+
+def shape_names(model: AnyModel, labels: Iterable[Any]) -> list[str]:
+    """Names of a learned shape's keypoints; empty for other models, and without names."""
+    if isinstance(model, Model) or not model.names:
+        return []
+    return [model.names[row] for row in model.rows(labels)]
 
 
 def name_rules(likely: Sequence[tuple[Rule, Agreement]]) -> str:

@@ -73,8 +73,8 @@ def align(
     views : View or sequence of View
         Evidence of each image. Views with ``cam_from_rig`` share one pose and determine the
         object's size. Views without it have one pose each, and share the stretch and the shape.
-        In a rig, views with masks need no keypoints. Without keypoints and ``init``, a single mask
-        needs an exact model with a mesh.
+        In a rig, views with masks need no keypoints. A single mask without keypoints needs
+        ``init``, or an exact model with a mesh.
     size : Size, optional
         Known lengths of the object.
     init : Alignment or sequence of Alignment or None, optional
@@ -85,8 +85,8 @@ def align(
         As for `cadalign.fit`.
     ransac : RansacOptions, optional
         Robust search, for keypoints with outliers. If the shape is not exact or the focal length is
-        unknown, ``minimal`` sets the size of the samples, ``max_iterations`` their largest number,
-        and ``refine=False`` refines only once on the inliers.
+        unknown, each sample (4 keypoints, or 6 with ``minimal="aepnp"``) is aligned by the search
+        itself, and ``refine=False`` refines only once on the inliers.
     focal : {"known", "estimate"}
         Use the cameras' focal lengths, or estimate them. Views with equal cameras share one focal
         length. ``result.cameras`` have the estimates.

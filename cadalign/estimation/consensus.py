@@ -136,7 +136,7 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
         from cadalign.estimation.joint import fit_jointly
 
         found = fit_jointly(problems, options, ransac, search.scores, start)
-        return replace(found, search=search)
+        return replace(found, ransac=ransac, doubt=search.doubt)
     alignment, inliers, iterations, hypotheses, score = _best_hypothesis(search)
     residuals = search.residuals_of(alignment)
     share = 1.0  # of alignments by chance with as little stretch
@@ -161,7 +161,8 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
         method=f"ransac-{found.method if ransac.refine else ransac.minimal}",
         stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
         # A corrected mistake has more inliers, so that as many samples suffice for it.
-        search=replace(search, ransac=replace(ransac, max_iterations=iterations)),
+        ransac=replace(ransac, max_iterations=iterations),
+        doubt=search.doubt,
     )
 
 

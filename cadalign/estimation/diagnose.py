@@ -21,12 +21,14 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, quote
 from cadalign.estimation.agreement import (
     LEAST_GAIN,
+    MOST_CORRECTED,
     UNIT,
     Agreement,
     AnyModel,
     DiagnosisCase,
     Rule,
     name_rules,
+    shape_names,
     warning_of,
 )
 from cadalign.estimation.assemble import result_of_keypoints
@@ -126,10 +128,9 @@ def diagnose_fit(
 
     Messages name keypoints by ``labels``, by default their rows.
     """
-    search, options, counted = fitted.search, fitted.options, fitted.is_counted
-    first = None if search is None else search.ransac
-    passes = [(np.isfinite(fitted.residuals).all(axis=1) & counted, first)]
-    if search and options.sigma is not None and fitted.fisher_covariance is not None:
+    given, options, counted = fitted.ransac, fitted.options, fitted.is_counted
+    passes = [(np.isfinite(fitted.residuals).all(axis=1) & counted, given)]
+    if given and options.sigma is not None and fitted.fisher_covariance is not None:
         passes.append((fitted.inliers, None))
     for kept, ransac in passes:
         # No samples are needed if all keypoints agree.
@@ -238,6 +239,14 @@ def _remove_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
     return replace(view, points_2d=view.pixels[kept], ids=ids, **some)
 
 
+def _exchange(view: View, *, number: int, rows: list[int]) -> View:
+    if view.number != number:
+        return view
+    pixels = view.pixels.copy()
+    pixels[rows] = pixels[rows[::-1]]
+    return replace(view, points_2d=pixels)
+
+
 def _remove_field(view: View, *, number: int, name: str | None) -> View | None:
     """Remove a field of the view with a number; None removes the view."""
     if view.number != number:
@@ -255,6 +264,8 @@ SWAPPED = Rule(
     lambda view: replace(view, points_2d=view.pixels[:, ::-1].copy()),
 )
 FLIPPED = Rule("mistake", "the photo is flipped", partial(_flip, axis=0))
+# Categories are nearly symmetric: exchanged names look like a flipped photo.
+EXCHANGED = FLIPPED._replace(clause="the photo is flipped or left and right are exchanged")
 UPSIDE_DOWN = Rule("mistake", "v counts from the bottom", partial(_flip, axis=1))
 DOWNWARD = Rule(
     "mistake",
@@ -276,6 +287,7 @@ def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     model, fails = case.model, not case.has_chance(given)
     yield from _mistakes_in(case)
     yield from _conflicting_pairs(case)
+    yield from _exchanged_pairs(case)
     yield from _other_sizes(case) if case.is_exact or fails else ()
     if case.is_plain and isinstance(model, Model) and fails:
         if model.stretch is not None or model.stretch_sigma is not None:
@@ -294,7 +306,7 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
     if isinstance(model, Model):  # learned models share one frame
         yield MIRRORED
     if any(len(view.keypoint_ids) for view in views):
-        yield from (SWAPPED, FLIPPED, UPSIDE_DOWN)
+        yield from (SWAPPED, FLIPPED if isinstance(model, Model) else EXCHANGED, UPSIDE_DOWN)
     if len(views) > 1 and views[0].cam_from_rig is not None:
         yield INVERTED
     if any(view.up is not None for view in views):
@@ -328,6 +340,18 @@ def _conflicting_pairs(case: DiagnosisCase) -> Iterator[Rule]:
                 clause += f"model and lie {apart:.3g} px apart"
                 undo = partial(_remove_rows, number=view.number, rows=(a, b))
                 yield Rule("mistake", clause, undo)
+
+
+def _exchanged_pairs(case: DiagnosisCase) -> Iterator[Rule]:
+    """Rules for a left and a right keypoint of a learned shape that are exchanged."""
+    for view in case.views:
+        shown = shape_names(case.model, view.keypoint_ids)
+        for row, name in enumerate(shown):
+            other = name.replace("left", "right")
+            if other != name and other in shown:
+                undo = partial(_exchange, number=view.number, rows=[row, shown.index(other)])
+                clause = f"keypoints {quote(name)} and {quote(other)} are exchanged"
+                yield Rule("mistake", clause, undo, most=MOST_CORRECTED)
 
 
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:

@@ -103,8 +103,8 @@ def fit(
         Motions that map the model to itself. Of all equivalent alignments, the result is the
         canonical one: nearest to upright (y up), with the model's z axis towards the camera.
         The others are no alternatives. ``result.points_3d`` are the keypoints of the canonical
-        alignment. If the stretch differs across an axis, only half turns about it stay symmetries;
-        ``stretch="y"`` keeps rotational symmetry about y. See `cadalign.geometry.symmetry`.
+        alignment. A stretch that differs between the two directions across an axis leaves only half
+        turns about it; ``stretch="y"`` keeps all turns about y. See `cadalign.geometry.symmetry`.
 
     Returns
     -------

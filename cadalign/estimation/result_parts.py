@@ -10,7 +10,7 @@ import math
 import sys
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,24 +21,11 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
 
-Kind = Literal[
-    "mistake",
-    "outlier",
-    "misfit",
-    "noise",
-    "chance",
-    "untested",
-    "outside-image",
-    "camera",
-    "stretch",
-    "contradiction",
-    "unit",
-    "mask",
-    "photo",
-    "left-out",
-    "focal",
-    "alternative",
-]
+Kind = (
+    Literal["mistake", "outlier", "misfit", "noise", "chance", "untested", "outside-image"]
+    | Literal["camera", "stretch", "contradiction", "unit", "mask", "photo", "left-out", "focal"]
+    | Literal["alternative"]
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -180,14 +167,6 @@ class FitStats:
 NO_STATS = FitStats(0, 0, 0.0)
 
 
-class KeypointSearch(Protocol):
-    """A robust search that can doubt the inliers it found."""
-
-    @property
-    def ransac(self) -> RansacOptions: ...
-    def doubt(self, residuals: FloatArray, inliers: BoolArray) -> EstimateWarning | None: ...
-
-
 @dataclass(frozen=True, eq=False)
 class FittedKeypoints:
     """Keypoints of an exact model in one view, with their alignment; fields as in `Result`."""
@@ -205,7 +184,8 @@ class FittedKeypoints:
     cost: float | None = None
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = NO_STATS
-    search: KeypointSearch | None = None  # with ransac
+    ransac: RansacOptions | None = None
+    doubt: Callable[[FloatArray, BoolArray], EstimateWarning | None] | None = None  # of inliers
     repeats: tuple[tuple[int, int], ...] = ()  # (row left out, row that it repeats)
 
     @property

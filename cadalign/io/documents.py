@@ -154,7 +154,7 @@ def name_file(path: Path | str) -> Iterator[None]:
         yield
     except CadalignError as error:
         whole, part = str(path), error.where or ""
-        if part != whole and not part.startswith(f"{whole}: "):
+        if part != whole and not part.startswith((f"{whole}: ", f"{whole}, ")):
             part = whole + (", " if part.startswith("line ") else ": " if part else "") + part
         raise DataError(error.what, where=part, fix=error.fix) from None
 

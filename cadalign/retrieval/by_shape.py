@@ -19,6 +19,7 @@ to the estimated ones.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -46,6 +47,8 @@ from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS
 from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
 from cadalign.solvers.marginal.problem import Seen, coordinates_of
+
+logger = logging.getLogger("cadalign")
 
 _LEAST_KEYPOINTS = 3
 _FREE_SIZE = 1.0  # standard deviation of the log size
@@ -114,6 +117,8 @@ def rank_by_shape(
     )
     loss: dict[str, Any] = {"loss": options.loss, "loss_scale": options.loss_scale}
     result = align(shape, view, **loss)
+    for each in result.warnings:
+        logger.warning("the estimated shape: %s", each.text)
     likely, log_evidence = shape_posterior(result, view, **loss)
     category, _ = table.keys[int(candidates.models[0])]
     known = _shapes_of(table, category, shape)

@@ -216,7 +216,8 @@ def _read_own_models(folder: Path) -> tuple[list[LibraryModel], dict[str, int]]:
     """Read a folder's models, and the semantic ids by name; see `Library.from_folder`."""
     files = keypoint_files(folder)
     if not files:
-        raise DataError("no model with keypoints", where=str(folder), fix=_FIX)
+        fix = f"{_FIX}; or give the folder that holds a data set's annotations/"
+        raise DataError("no model with keypoints", where=str(folder), fix=fix)
     read = [(path, ModelKeypoints.load(path)) for path in files]
     names = _semantic_ids(read)
     models = [_model(path, found, names) for path, found in read]

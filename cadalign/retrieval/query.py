@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cadalign.datasets.image_keypoints import first_names, plain_name
-from cadalign.errors import DataError, InputError, refuse_unused, unknown_name
+from cadalign.errors import DataError, InputError, quote, refuse_unused, unknown_name
 from cadalign.io.documents import convert, name_file, read_json
 from cadalign.io.files import once_per_file
 from cadalign.io.observation import Observation, ObservationChanges
@@ -79,15 +79,22 @@ class ObservationRetrieval:
         library, shape = self.open_files()
         if shape is not None and seen.names and {*seen.names} <= {*shape.names}:
             return replace(seen, ids=np.array(shape.ids)[shape.rows(seen.names)])
-        if seen.ids is not None and len(seen.points_2d):
-            return seen
+        ids = seen.ids
         with name_file(where):
             if not len(seen.points_2d):
                 raise DataError("there are no keypoints")
-            if seen.names is None:
-                fix = "give each its id or name in the library"
-                raise DataError("the keypoints have no semantic_id and no name", fix=fix)
-            return replace(seen, ids=library.ids_of(seen.names))
+            if ids is None:
+                if seen.names is None:
+                    fix = "give each its id or name in the library"
+                    raise DataError("the keypoints have no semantic_id and no name", fix=fix)
+                ids = library.ids_of(seen.names)
+        if shape is None or not shape.names:
+            return replace(seen, ids=ids)
+        # `cadalign fit --shape` knows the shape's names, but not the library's ids.
+        name_of = dict(zip(shape.ids, shape.names, strict=True))
+        given = seen.names or [f"keypoint {label}" for label in ids]
+        names = [name_of.get(int(label), name) for label, name in zip(ids, given, strict=True)]
+        return replace(seen, ids=ids, names=tuple(names))
 
     def retrieve(self, seen: Observation, where: str, *, workers: int = -1) -> list[Match]:
         """Rank the library's models by an observation with ids; see `Library.retrieve`."""
@@ -128,7 +135,7 @@ def relabel(
 
     ``names`` are the library's ids by name, ``table`` the shape's name or id of those that differ.
     Without names of its own, the library has the shape's ids. Raises InputError if the table has an
-    unknown name, or fewer than 3 keypoints agree.
+    unknown name or gives a keypoint twice, or fewer than 3 keypoints agree.
     """
     if unused := [name for name in table if name not in names]:
         raise unknown_name("keypoint of the library", unused[0], names, where="keypoint_names")
@@ -136,12 +143,14 @@ def relabel(
         return shape
     row_of = {f"keypoint {label}": row for row, label in enumerate(shape.ids)}
     row_of |= {plain_name(name): row for row, name in enumerate(shape.names)}
-    own: dict[int, int] = {}
-    for name, number in names.items():
-        if name in table:
-            own[int(shape.rows([table[name]], where="keypoint_names")[0])] = number
-        elif (row := row_of.get(plain_name(name))) is not None:
-            own.setdefault(row, number)
+    own = {row_of.get(plain_name(each), -1): names[each] for each in names if each not in table}
+    own.pop(-1, None)
+    named = dict[int, str]()
+    for row, name in zip(shape.rows(table.values(), where="keypoint_names"), table, strict=True):
+        if (other := named.setdefault(int(row), name)) != name:
+            what = f"{quote(other)} and {quote(name)} are one keypoint of {shape.category}"
+            raise InputError(what, where="keypoint_names", fix="leave out one of the two")
+        own[int(row)] = names[name]
     if len(own) < _LEAST_KEYPOINTS:
         what = f"{len(own)} of its keypoints ({first_names(list(names))}) are {shape.category}'s"
         fix = "give keypoint_names, a JSON table of its names with the shape's names"
@@ -154,4 +163,5 @@ def relabel(
 @once_per_file(4)
 def _read_table(path: Path) -> _Table:
     with name_file(path):
-        return tuple(convert(read_json(path), dict[str, str | int]).items())
+        entries = convert(read_json(path), dict[str, Any]).items()
+        return tuple((name, convert(each, str | int, name)) for name, each in entries)

@@ -140,23 +140,31 @@ def tabulate(
     _check_names(examples)
     _check_shared(examples)
     _warn_of_units(examples)
-    ids = tuple(sorted({label for each in examples for label in each.ids}))
-    column = {label: row for row, label in enumerate(ids)}
-    rows = np.full((len(examples), len(ids) + BOX_ROWS, 3), np.nan)
+    _warn_of_axes(examples)
+    ids, points = _stack(examples)
+    boxes = np.full((len(examples), BOX_ROWS, 3), np.nan)
     measured = 2 * sum(each.bounds is not None for each in examples) >= len(examples)
-    for row, each in zip(rows, examples, strict=True):
-        row[[column[label] for label in each.ids]] = each.points_3d
+    for box, each in zip(boxes, examples, strict=True):
         if not measured:
-            row[-BOX_ROWS:] = extent(each.points_3d)
+            box[:] = extent(each.points_3d)
         elif each.bounds is not None:
-            row[-BOX_ROWS:] = each.bounds
-    _warn_of_axes(examples, rows[:, :-BOX_ROWS])
+            box[:] = each.bounds
     shapes = TrainingShapes(
         tuple(each.model_id for each in examples),
-        rows[:, :-BOX_ROWS].astype(np.float32),
+        points.astype(np.float32),
         tuple(each.mesh_path for each in examples),
     )
-    return ids, rows, shapes
+    return ids, np.concatenate([points, boxes], axis=1), shapes
+
+
+def _stack(examples: Sequence[Example]) -> tuple[tuple[KeypointId, ...], FloatArray]:
+    """All ids, sorted, and the models' keypoints (N, m, 3), NaN if missing."""
+    ids = tuple(sorted({label for each in examples for label in each.ids}))
+    column = {label: row for row, label in enumerate(ids)}
+    points = np.full((len(examples), len(ids), 3), np.nan)
+    for row, each in zip(points, examples, strict=True):
+        row[[column[label] for label in each.ids]] = each.points_3d
+    return ids, points
 
 
 def _check_names(examples: Sequence[Example]) -> None:
@@ -202,11 +210,12 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
         _warn("of another size", len(rows), examples, whole[rows[0]], why)
 
 
-def find_other_axes(rows: FloatArray) -> dict[int, FloatArray]:
-    """Find models that fit the others only if axes are exchanged or reversed.
+def find_other_axes(examples: Sequence[Example]) -> dict[int, FloatArray]:
+    """Find models that fit the others only with exchanged or reversed axes.
 
-    ``rows`` are keypoints (N, m, 3), NaN if missing. Returns the axes (3, 3) that fit, by model.
+    Returns the axes (3, 3) that fit, by the row of the model.
     """
+    _, rows = _stack(examples)
     count = np.isfinite(rows[..., 0]).sum(axis=1)
     some = np.flatnonzero(count >= _LEAST_TO_TURN)
     if not len(some):
@@ -225,8 +234,8 @@ def find_other_axes(rows: FloatArray) -> dict[int, FloatArray]:
     return turned
 
 
-def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
-    if turned := find_other_axes(rows):
+def _warn_of_axes(examples: Sequence[Example]) -> None:
+    if turned := find_other_axes(examples):
         odd, turn = next(iter(turned.items()))
         axes = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
         why = f"fit with ({', '.join(axes)}) as (x, y, z)"

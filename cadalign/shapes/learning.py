@@ -89,9 +89,7 @@ class _Models:
         """Vectors to learn from and the Gaussian of all, which all numbers of components share."""
         single = replace(recipe, components=1)
         if single not in self._cache:
-            vectors = self.vectors
-            if recipe.mirror is not None:
-                vectors = _vectors(self.rows, recipe.mirror)
+            vectors = _vectors(self.rows, recipe.mirror)
             floor, strength = _FLOOR * self.size, recipe.strength
             gaussian = learn_gaussian(vectors, strength=strength, floor=floor, rounds=_ROUNDS)
             self._cache[single] = vectors, gaussian
@@ -237,12 +235,7 @@ def learn_parts(
         )
         for weight, mean, covariance in parts
     )
-    return {
-        "ids": ids,
-        "components": tuple(learned),
-        "training": training,
-        **calibration,
-    }
+    return {"ids": ids, "components": tuple(learned), "training": training, **calibration}
 
 
 def _vectors(rows: FloatArray, mirror: Mirror | None) -> Vectors:

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import trimesh
 from support.exported import CAMERA, KEYPOINTS, POSE, photo_of, turned, wedge
+from support.files import write_json
 
 from cadalign import Result, ShapeModel, View, align
 from cadalign.cli import main
-from cadalign.datasets import load_mesh
+from cadalign.datasets import ModelKeypoints, load_mesh
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.export import ExportView
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.images import write_image
 from cadalign.io.meshes.files import write_mesh
@@ -144,3 +147,33 @@ def test_a_shape_without_meshes_is_exported_as_its_box(tmp_path: Path) -> None:
     assert len(mesh.faces) == 12
     ends = np.sort(mesh.vertices, axis=0)[[0, -1]]
     np.testing.assert_allclose(ends, np.sort(found.box.corners, axis=0)[[0, -1]], atol=1e-5)
+
+
+def test_the_best_match_of_an_own_library_is_exported_in_the_estimated_shape(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The library has names and ids of its own, and the photo's keypoints have the library's."""
+    shape, rng = ShapeModel.pretrained("laptop"), np.random.default_rng(0)
+    points, folder = shape.mean[:-2], tmp_path / "laptop"
+    folder.mkdir()
+    for number in range(4):
+        own = points * rng.uniform(0.8, 1.2, 3)
+        mesh = Mesh(own, [[0, 1, 2], [0, 2, 3], [2, 3, 4], [3, 4, 5]])
+        write_mesh(folder / f"{number}.obj", mesh, kind="obj")
+        named = zip("fedcba", own.tolist(), strict=False)
+        keypoints = ModelKeypoints(tuple(ModelKeypoint(name, tuple(xyz)) for name, xyz in named))
+        keypoints.save(folder / f"{number}.keypoints.json")
+    library, found = tmp_path / "own.cadalign", tmp_path / "found"
+    assert main(["library", "build", str(tmp_path), "--out", str(library)]) == 0
+    table = write_json(tmp_path / "table.json", dict(zip("fedcba", shape.names, strict=False)))
+    pixels = CAMERA.project(POSE.apply(points))
+    query = Observation(points, pixels, CAMERA, names=tuple("fedcba"))
+    query.save(tmp_path / "photo.json")
+    options = ["--library", str(library), "--shape", "laptop", "--keypoint-names", str(table)]
+    assert main(["retrieve", str(tmp_path / "photo.json"), *options, "--out", str(found)]) == 0
+    assert main(["fit", str(found / "match_01.json"), "--shape", "laptop", "--no-picture"]) == 0
+    target = tmp_path / "laptop.ply"
+    assert main(["export", str(found / "match_01_fit"), "--to", str(target)]) == 0
+    placed = CAMERA.project(load_mesh(target).vertices)
+    gaps = np.linalg.norm(placed[:, None] - pixels, axis=2).min(axis=0)
+    assert gaps.max() < 1.0

@@ -157,6 +157,10 @@ def test_invalid_folders_are_refused(
 ) -> None:
     text = refusal_text(lambda: Library.from_folder(tmp_path))
     assert "no model with keypoints; `cadalign annotate PHOTO MODEL` marks keypoints" in text
+    (tmp_path / "chair.stl").touch()
+    line = refusal_line(capsys, "library", "build", tmp_path)
+    assert f"{tmp_path}: no model with keypoints; `cadalign annotate PHOTO MODEL` marks" in line
+    (tmp_path / "chair.stl").unlink()
     line = refusal_line(capsys, "library", "build", case.folder, "--split", "train")
     assert line.startswith("--split: has no effect on a folder of own models")
     (tmp_path / "c1.obj").write_text((case.models / "c1.obj").read_text())

@@ -199,6 +199,13 @@ def test_the_command_ranks_as_the_call(tmp_path: Path, capsys: pytest.CaptureFix
     assert found == [match.model_id for match in called]
 
 
+def test_a_wrong_estimate_of_the_shape_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    first(OBJECTS[0])
+    assert not caplog.records
+    LIBRARY.retrieve(seen(OBJECTS[0])[::-1], OBJECTS[0].ids, CAMERA, shape=SHAPE)
+    assert "the estimated shape: " in caplog.text
+
+
 # --- the posterior of all keypoints and the box ------------------------------------------------
 
 NEAR = Alignment(np.diag([1.0, -1.0, -1.0]), np.array([0.1, 0.05, 5.0]), np.ones(3))

@@ -12,6 +12,7 @@ import pytest
 import cadalign
 from cadalign import Alignment, Camera, ShapeModel, View
 from cadalign.errors import InputError
+from cadalign.render import look_at
 from cadalign.retrieval.query import relabel
 from cadalign.shapes.pretrained import CATEGORIES, shape_path
 
@@ -107,6 +108,44 @@ def test_a_library_with_other_names_needs_a_table():
     assert relabel(shape, names, table, where="").ids == (7, 3, 5, 8, 9, 1)
     with pytest.raises(InputError, match=r"unknown keypoint of the library 'x'"):
         relabel(shape, names, {"x": 0}, where="")
+    with pytest.raises(InputError, match=r"keypoint_names: 'fr' and 'hr' are one keypoint of lap"):
+        relabel(shape, names, {"fr": "hinge, right", "hr": 1}, where="")
+
+
+def exchange(name):
+    return name.replace("right", "#").replace("left", "right").replace("#", "left")
+
+
+PAIR = "keypoints '{0} left' and '{0} right' are exchanged"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ("", "the photo is flipped or left and right are exchanged"),
+        ("seat, front", PAIR.format("seat, front")),
+        ("back, top", PAIR.format("back, top")),
+    ],
+)
+def test_left_and_right_that_are_exchanged_are_named(wrong, text):
+    shape = ShapeModel.pretrained("chair")
+    rows = shape.rows([0, 1, 2, 3, 4, 5, 17, 18, 19, 20])
+    pose = look_at(azimuth=30.0, elevation=20.0, distance=2.5)
+    pixels = CAMERA.project(pose.apply(shape.mean[rows]))
+    names = [shape.names[row] for row in rows]
+    assert not cadalign.align(shape, View(CAMERA, pixels, ids=names, sigma=2.0)).warnings
+    clicked = [exchange(each) if wrong in each else each for each in names]
+    (found,) = cadalign.align(shape, View(CAMERA, pixels, ids=clicked, sigma=2.0)).warnings
+    assert text in found.text
+
+
+def test_warnings_call_keypoints_by_their_names():
+    shape = ShapeModel.pretrained("chair")
+    rows = shape.rows([0, 1, 2, 3, 4, 5, 17, 20])
+    pixels = CAMERA.project(POSE.apply(shape.mean[rows]))
+    pixels[0] += 90
+    (found,) = cadalign.align(shape, View(CAMERA, pixels, ids=shape.ids[:6] + (17, 20))).warnings
+    assert "keypoint 'back, top right' (" in found.text
 
 
 def test_the_script_learns_the_files(real_data, monkeypatch, tmp_path):

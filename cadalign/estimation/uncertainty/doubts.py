@@ -56,11 +56,11 @@ def keypoint_warnings(
     options, kept = fitted.options, fitted.points_3d[fitted.inliers]
     if fitted.sigma is not None and options.sigma is None:
         found += noise_doubts(fitted.sigma, [observed])
-    if fitted.search is not None:
+    if fitted.ransac is not None and fitted.doubt is not None:
         agreeing = residuals[counted], fitted.inliers[counted]
-        chance = fitted.search.doubt(*agreeing)
+        chance = fitted.doubt(*agreeing)
         found += () if chance is None else (chance,)
-        found += rejections(*agreeing, fitted.search.ransac, sigma)
+        found += rejections(*agreeing, fitted.ransac, sigma)
     if 2 * len(kept) <= options.unknowns:
         text = (
             f"{len(kept)} keypoints always fit exactly: "
@@ -73,7 +73,7 @@ def keypoint_warnings(
     if cause is None:
         found += stretch_doubts(fitted.alignment, uncertainty_of(covariance), options)
     # Likelihoods are meaningless after a misfit, or with different outliers.
-    if cause is None and fitted.search is None:
+    if cause is None and fitted.ransac is None:
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
         found += pose_doubts(fitted.alignment, poses, covariance)
     return tuple(found)
@@ -99,8 +99,8 @@ def order_warnings(placed: Warnings, cause: EstimateWarning | None) -> list[Esti
 
 
 def _fits(fitted: FittedKeypoints) -> bool:
-    if fitted.search is not None or fitted.cost is None:
-        return fitted.search is None
+    if fitted.ransac is not None or fitted.cost is None:
+        return fitted.ransac is None
     if fitted.options.sigma is None:
         return not is_large_sigma(fitted.sigma or 0.0, [fitted.observed[fitted.inliers]])
     return chance_of(fitted.cost, fitted.redundancy) >= FALSE_ALARMS

@@ -147,7 +147,7 @@ def _rms_px(estimates: Sequence[Alignment], instances: Sequence[Instance]) -> Fl
 # Cramer-Rao bound and coverage --------------------------------------------------------------------
 
 
-def scaled_columns(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _scaled_columns(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Scale columns to length 1 and return their lengths; raises DegenerateError if singular."""
     norms = np.linalg.norm(rows, axis=0)
     scaled = rows / np.where(norms > 0, norms, 1.0)
@@ -168,7 +168,7 @@ def limit_estimate(
     jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
     jacobian = jacobian.reshape(-1, UNKNOWNS)
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
-    scaled, norms = scaled_columns(jacobian)
+    scaled, norms = _scaled_columns(jacobian)
     step = np.linalg.solve(scaled.T @ scaled, scaled.T @ noise) / norms
     # The exponential of a weakly determined scale would overflow.
     factors = np.exp(np.clip(step[6:], -_LARGEST_LOG, _LARGEST_LOG))

@@ -53,7 +53,7 @@ _LARGEST = 4096  # side [px] of images that OpenGL draws; larger ones are ray ca
 _SIZE_STEP = 64
 
 
-class PyrenderRenderer:
+class PyrenderRenderer(RaycastRenderer):
     """Renderer with OpenGL under EGL; depth, triangle indices and normals are ray cast.
 
     Models with transparent parts and cameras with lens distortion are ray cast entirely. All
@@ -65,11 +65,10 @@ class PyrenderRenderer:
     name = "pyrender"
 
     def __init__(self, *, studio: Studio | None) -> None:
-        self.studio = studio or Studio()
+        super().__init__(studio=studio)
         self._context = shared_context()
         self._context.check_process()
         self._stage = GlStage(self.studio)
-        self._fallback = RaycastRenderer(studio=self.studio)
 
     @property
     def device(self) -> str:
@@ -90,7 +89,7 @@ class PyrenderRenderer:
         is_bent = camera.is_wide or bool(camera.distortion)
         is_large = max(camera.width, camera.height) > _LARGEST
         if is_bent or is_large or samples == 1 or not scene.surface.opaque:
-            return self._fallback.render(scene, camera, cam_from_model, samples=samples)
+            return super().render(scene, camera, cam_from_model, samples=samples)
         check_samples(samples)
         check_image_size(camera)
         posed = pose_scene(scene, camera, cam_from_model)

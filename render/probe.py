@@ -16,7 +16,8 @@ from cadalign.errors import RenderError, brief, unknown_name
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.scene import Renderer, Scene
+from cadalign.render.raycast import RaycastRenderer
+from cadalign.render.scene import Scene
 from cadalign.render.surface import Studio
 
 RENDERERS: dict[str, str] = {
@@ -102,10 +103,10 @@ def report(name: str) -> None:
     sys.stdout.flush()
 
 
-def load_renderer(name: str, studio: Studio | None) -> Renderer:
+def load_renderer(name: str, studio: Studio | None) -> RaycastRenderer:
     """Make a renderer without a test, which may crash the process."""
     module, _, kind = RENDERERS[name].partition(":")
-    renderer: Renderer = getattr(import_module(module), kind)(studio=studio)
+    renderer: RaycastRenderer = getattr(import_module(module), kind)(studio=studio)
     return renderer
 
 
@@ -130,7 +131,7 @@ AUTO = "auto"
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
 
 
-def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer:
+def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> RaycastRenderer:
     """Make a renderer.
 
     Renderers other than ``raycast`` are first tested in a subprocess, since broken graphics
@@ -148,7 +149,7 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
 
     Returns
     -------
-    Renderer
+    RaycastRenderer
 
     Raises
     ------

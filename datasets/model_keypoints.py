@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from cadalign.io.documents import (
 )
 from cadalign.io.files import as_path, write_json
 from cadalign.io.kinds import MESH_ENDINGS, MODEL_KEYPOINTS
+
+if TYPE_CHECKING:
+    from cadalign.shapes.model import ShapeModel
 
 SUFFIX = ".keypoints.json"
 """Ending of a keypoint file: ``chair.obj`` has ``chair.keypoints.json``."""
@@ -117,6 +120,15 @@ class ModelKeypoints:
         rows = zip(model.keypoints.ids.tolist(), model.keypoints.xyz.tolist(), strict=True)
         keypoints = (ModelKeypoint(f"keypoint {k}", tuple(xyz), k) for k, xyz in rows)
         return cls(tuple(keypoints), model.mesh_path)
+
+    @classmethod
+    def from_shape(cls, shape: ShapeModel) -> ModelKeypoints:
+        """Keypoints of a learned shape's mean; one without a name is called "keypoint 3"."""
+        labels = shape.names or shape.ids
+        names = [each if isinstance(each, str) else f"keypoint {each}" for each in labels]
+        numbers = [each if isinstance(each, int) else None for each in shape.ids]
+        rows = zip(names, map(tuple, shape.mean.tolist()), numbers, strict=False)
+        return cls(tuple(ModelKeypoint(*row) for row in rows))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ModelKeypoints:

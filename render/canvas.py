@@ -23,7 +23,7 @@ _SMALL_SIDE = 1000
 # Widths of casings, in units; markers are small and need a wider one.
 _LINE_CASING, _MARKER_CASING = 0.6, 0.75
 
-_Strokes = tuple[tuple[Color, int], tuple[Color, int]]
+_Strokes = tuple[tuple[Color, int], ...]
 
 
 LegendEntry = tuple[str, Color, str]
@@ -75,6 +75,10 @@ class Canvas:
         """Draw a line through pixels (n, 2); ``width`` is in units."""
         parts = _dashes(points, 7 * self.unit, 5 * self.unit) if dashed else points[None]
         self._lines(parts, self._strokes(color, width=width, casing=_LINE_CASING))
+
+    def hairline(self, points: FloatArray, color: Color) -> None:
+        """Draw a thin line without a casing through pixels (n, 2)."""
+        self._lines(points[None], self._strokes(color, width=1.0, casing=0.0)[1:])
 
     def _lines(self, parts: FloatArray, strokes: _Strokes) -> None:
         """Draw lines through pixels (m, n, 2), all casings first."""

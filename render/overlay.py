@@ -61,6 +61,7 @@ def draw_overlay(
     gt_box: Box | None = None,
     est_box: Box | None = None,
     est_frame: Geometry | None = None,
+    skeleton: npt.ArrayLike = (),
     observed: npt.ArrayLike | None = None,
     reprojected: npt.ArrayLike | None = None,
     unseen: npt.ArrayLike | None = None,
@@ -87,6 +88,8 @@ def draw_overlay(
     est_frame : Geometry, optional
         The predicted model, rendered with this camera: a `Frame` is drawn in its own colours, the
         geometry of `cast_geometry` as a red veil.
+    skeleton : (s, 2, 3) float
+        Thin lines between predicted keypoints, in the camera frame.
     observed, reprojected : (k, 2) float, optional
         Keypoints [px]; if both are given, their rows correspond. Reprojected ones that are not
         finite (behind the camera) are omitted.
@@ -127,6 +130,9 @@ def draw_overlay(
     if est_frame is not None:
         draw_lines(canvas, est_frame, EST_COLOR)
     marks = KeypointMarks.from_arrays(observed, reprojected, unseen, regions, outliers)
+    for ends in np.asarray(skeleton, dtype=float):
+        for stroke in _strokes(ends, camera, EST_COLOR):
+            canvas.hairline(stroke.points, stroke.color)
     strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:
@@ -305,8 +311,8 @@ def draw_result(
     Confidence regions of keypoints that were not observed are drawn in the first view, or in all
     views of a rig. ``photo`` is as for `draw_overlay`, ``result`` a `cadalign.Result`, and
     ``number`` the index of the view. ``mesh`` (see `mesh_of`) and the box's ``bounds`` (2, 3) are
-    in the model frame before the stretch; by default the bounds are the result's. The contour of
-    ``mask`` (h, w) is drawn.
+    in the model frame before the stretch; by default the bounds are the result's. Without a mesh
+    the result's lines are drawn. The contour of ``mask`` (h, w) is drawn.
     """
     view = result.views[number]
     camera, alignment = view.camera, view.alignment
@@ -331,6 +337,7 @@ def draw_result(
         camera,
         est_box=Box.from_model(result.bounds if bounds is None else bounds, alignment),
         est_frame=frame,
+        skeleton=in_camera[result.lines] if mesh is None else (),
         observed=view.points_2d,
         reprojected=camera.project_where_ahead(own),
         unseen=camera.project(in_camera[unseen]) if unseen.any() else None,

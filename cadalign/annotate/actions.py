@@ -12,7 +12,8 @@ from typing import Any, get_type_hints
 import msgspec
 import numpy as np
 
-from cadalign.annotate.marks import ObjectShape, Pair
+from cadalign.annotate.keypoints import ObjectShape
+from cadalign.annotate.marks import Pair
 from cadalign.annotate.photos import ObjectMask, segment_box
 from cadalign.annotate.session import Annotation, Session
 from cadalign.errors import InputError, quote, unknown_name
@@ -105,13 +106,13 @@ def skip(state: Annotation) -> ActionOutcome | None:
     if proposed is None:
         state.skipped.clear()
     else:
-        state.skipped.add(proposed)
+        state.skipped.add(state.model.registry[proposed].name)
     return None
 
 
 def category(state: Annotation, *, name: Text) -> ActionOutcome:
     """Exchange the category of the object in this photo; pairs of equal names stay."""
-    if not state.can_exchange:
+    if not state.model.can_exchange:
         raise InputError("only categories that come with cadalign can be exchanged", where="name")
     if name not in CATEGORIES:
         raise unknown_name("category", name, CATEGORIES, where="name")
@@ -121,7 +122,7 @@ def category(state: Annotation, *, name: Text) -> ActionOutcome:
     text = f"The object in this photo is a {name} now. {kept} of {before} pairs stay."
     if kept < before:
         text += " Choose keypoints for the others on the right."
-    return ActionOutcome(message=f"{text} This cannot be undone.")
+    return ActionOutcome(message=text)
 
 
 def pick(
@@ -174,9 +175,9 @@ def rename(state: Annotation, *, pair: Index, name: Text) -> ActionOutcome:
 def identify(state: Annotation, *, pair: Index, label: Index | Text) -> ActionOutcome:
     """Identify the model point of a pair as a keypoint of the shape."""
     keypoint, registry = state.marks.pair(pair).keypoint, state.model.registry
-    if keypoint is None or label not in state.shape.ids:
+    if keypoint is None or label not in state.model.shape.ids:
         raise InputError(f"{quote(label)} is not a keypoint of the shape", where="label")
-    if state.shape.is_named:
+    if state.model.shape.is_named:
         registry.rename(keypoint, str(label))
         return ActionOutcome(pair)
     if label in registry:

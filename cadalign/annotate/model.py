@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.files import LastContent, keypoints_file, refuse_other_model
-from cadalign.annotate.marks import KeypointRegistry, ObjectShape, Pair
+from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import InputError
+from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import BOX_EDGES, Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -36,20 +36,6 @@ _MOST_LINES = 3000
 _CREASE_DEG = 30.0
 _LONGEST = 1 / 24  # line [diagonals]: each line is drawn or hidden as a whole
 _BOX_PIECES = 16
-
-
-class Lines(Protocol):
-    """Lines of a model that are drawn over the photo."""
-
-    @property
-    def creases(self) -> FloatArray:
-        """The lines that always show, (k, 2, 3) float [model units]."""
-
-    def warp(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Lines:
-        """Warp the lines, so that points ``source`` (m, 3) move to ``target`` (m, 3)."""
-
-    def project(self, camera: Camera, alignment: Alignment) -> FloatArray:
-        """Project the visible lines of the stretched model to pixels (k, 2, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +68,7 @@ class Wireframe:
 
     @property
     def creases(self) -> FloatArray:
-        """The lines that always show, (k, 2, 3) float [model units]."""
+        """Creases and borders, (k, 2, 3) float [model units]."""
         return self._mesh.vertices[self._creases]
 
     def warp(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Wireframe:
@@ -166,9 +152,14 @@ class ClickableModel:
             raise InputError("all vertices of the mesh coincide", where=mesh.source)
 
     @cached_property
-    def wireframe(self) -> Lines:
+    def wireframe(self) -> Wireframe:
         """The lines of the model."""
         return Wireframe.from_scene(self.scene)
+
+    @property
+    def creases(self) -> FloatArray:
+        """The lines that always show, (k, 2, 3) float [model units]."""
+        return self.wireframe.creases
 
     def to_display(self, xyz: npt.ArrayLike) -> FloatArray:
         """Turn model coordinates (..., 3) into the page's: centred, with a diagonal of 1."""
@@ -205,7 +196,7 @@ class ClickableModel:
         weights = np.full((len(first), 3), 1 / 3, dtype=np.float32)
         color = self.scene.surface.color(triangles, weights)[:, None, :3]
         shown = Mesh(self.to_display(small.vertices), small.faces[first])
-        creases = self.to_display(self.wireframe.creases)
+        creases = self.to_display(self.creases)
         arrays = (
             shown.triangles,
             Scene(shown).corner_normals,
@@ -218,7 +209,7 @@ class ClickableModel:
 
 @dataclass(eq=False)
 class MarkedModel:
-    """A model that can be clicked on, its keypoints, and the file they are written to.
+    """A model that can be clicked on, its keypoints and their file, and the objects' shape.
 
     Without a ``path`` it is the skeleton of a learned shape, and nothing is written.
     """
@@ -226,6 +217,7 @@ class MarkedModel:
     path: Path | None
     cad: ClickableModel
     registry: KeypointRegistry
+    shape: ObjectShape
     keypoints_path: Path
     content: LastContent = field(default_factory=LastContent)  # of the keypoints file
 
@@ -234,9 +226,27 @@ class MarkedModel:
         """True for the skeleton of a learned shape."""
         return self.path is None
 
-    def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
-        """The model points of pairs that have one."""
-        return [self.registry[pair.keypoint] for pair in pairs if pair.keypoint is not None]
+    @property
+    def can_exchange(self) -> bool:
+        """True if the model is the skeleton of a category, which can be exchanged for another."""
+        return self.is_skeleton and self.shape.category is not None
+
+    @property
+    def numbers(self) -> dict[Any, int]:
+        """Semantic ids of the keypoints by the shape's ids or names of them."""
+        return {self.shape.id_of(point): number for number, point in self.registry}
+
+    def lines(self, result: Result) -> FloatArray:
+        """Project the visible lines of the estimated object to pixels (k, 2, 2)."""
+        if self.is_skeleton:
+            lines = split_lines(result.points_3d[result.lines], _LONGEST * self.cad.diagonal)
+            return project_lines(lines, result.camera, result.alignment)
+        wireframe, numbers = self.cad.wireframe, self.numbers
+        if self.shape.learned is not None:  # move known keypoints to their estimates
+            rows = [row for row, label in enumerate(result.ids) if label in numbers]
+            source = positions_of(self.registry[numbers[result.ids[row]]] for row in rows)
+            wireframe = wireframe.warp(source, result.points_3d[rows], result.bounds)
+        return wireframe.project(result.camera, result.alignment)
 
     def write_keypoints(self, used: frozenset[int]) -> None:
         """Write all keypoints that are in use or from files; raises DataError on failure."""
@@ -269,4 +279,4 @@ def open_model(
             if source == own:
                 refuse_other_model(read.model, path, where=own)
             registry.merge(read.keypoints)
-    return MarkedModel(path, cad, registry, own, content)
+    return MarkedModel(path, cad, registry, shape, own, content)

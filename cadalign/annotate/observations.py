@@ -18,7 +18,8 @@ import msgspec
 import numpy as np
 
 from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
-from cadalign.annotate.marks import KeypointRegistry, Marks, ObjectShape, Pair, positions_of
+from cadalign.annotate.keypoints import ObjectShape, positions_of
+from cadalign.annotate.marks import Marks, Pair
 from cadalign.annotate.model import MarkedModel
 from cadalign.annotate.photos import ObjectMask, PhotoFile, camera_of
 from cadalign.annotate.skeleton import open_skeleton
@@ -66,15 +67,13 @@ class ObservationFile:
 
     path: Path
     photo: PhotoFile
-    model: MarkedModel
-    shape: ObjectShape
     stored: Observation = field(init=False)
     """Content of the file when it was opened; the marks replace parts of it."""
     _content: LastContent = field(default_factory=LastContent, repr=False)
     _drawn: tuple[ObjectMask, Path] | None = None  # the last mask that was written, and its file
 
-    def read(self, given: Camera | None, *, up_axis: Any = None) -> Marks:
-        """Read the marks of an earlier session, and add new model points to the registry.
+    def read(self, model: MarkedModel, given: Camera | None, *, up_axis: Any = None) -> Marks:
+        """Read the marks of an earlier session, and add new points to the model.
 
         ``given`` is the camera if there is no file. Raises a CadalignError if a file is invalid.
         """
@@ -83,30 +82,30 @@ class ObservationFile:
             camera = camera_of(self.photo, given)
             nothing = np.empty((0, 3)), np.empty((0, 2))
             self.stored = Observation(*nothing, camera, up_axis=up_axis or "y")
-            return Marks(camera)
+            return Marks(camera, model)
         stored = self._load()
         if stored.others:
             what = f"has {len(stored.views)} views, the annotator only opens files of one photo"
             raise DataError(what, where=str(self.path), fix=_OTHER_FILE)
-        refuse_other_model(stored.model, self.model.path, where=self.path)
-        if self.shape.category and self.model.is_skeleton and stored.shape is not None:
+        refuse_other_model(stored.model, model.path, where=self.path)
+        if model.can_exchange and stored.shape is not None:
             own = ObjectShape.open(stored.shape)
-            if own.category not in (None, self.shape.category):
-                self.model, self.shape = open_skeleton(own), own
+            if own.category not in (None, model.shape.category):
+                model = open_skeleton(own)
         refuse_other_photo(stored.image, self.photo.path, where=self.path)
-        self._warn_of_options(stored)
+        self._warn_of_options(stored, model)
         with name_file(self.path), name_part("unfinished"):
             unfinished = convert(stored.draft or {}, _Unfinished)
         self.stored = stored if up_axis is None else replace(stored, up_axis=up_axis)
         mask = stored.evidence.mask
         marks = Marks(
             camera_of(self.photo, stored.camera),
+            model,
             mask=None if mask is None else ObjectMask(mask, stored.evidence.mask_sigma),
             photo=bool(stored.fit_options.get("image")),
             start=stored.init,
         )
-        marks = _add_pairs(marks, stored, self.model.registry)
-        return _add_halves(marks, unfinished.pairs, self.model.registry)
+        return _add_halves(_add_pairs(marks, stored), unfinished.pairs)
 
     def write(self, observation: Observation) -> None:
         """Write the observation; raises DataError on failure, or if others changed the file.
@@ -124,21 +123,19 @@ class ObservationFile:
         return FocalPrior(**stored) if isinstance(stored, Mapping) else stored
 
     @property
-    def stretch_sigma(self) -> float | None:
-        """Standard deviation of the prior on the stretch; None for a learned shape."""
-        if self.shape.learned is not None:
-            return None
-        return self.stored.fit_options.get("stretch_sigma") or LIKELY_STRETCH
+    def stretch_sigma(self) -> float:
+        """Standard deviation of the prior on the stretch of a model without a learned shape."""
+        return float(self.stored.fit_options.get("stretch_sigma") or LIKELY_STRETCH)
 
     def usable_pairs(self, marks: Marks) -> tuple[Pair, ...]:
         """Return the complete pairs that a fit uses: pairs of keypoints that the shape has.
 
         With a mask and without a start, a few pairs are not used: the mask alone aligns.
         """
-        pairs = marks.complete_pairs
-        known = self.shape.knows(self.model.points_of(pairs))
+        pairs, shape = marks.complete_pairs, marks.model.shape
+        known = shape.knows(marks.points_of(pairs))
         counting = tuple(pair for pair, counts in zip(pairs, known, strict=True) if counts)
-        by_mask = marks.mask is not None and marks.start is None and self.shape.learned is None
+        by_mask = marks.mask is not None and marks.start is None and shape.learned is None
         return () if by_mask and len(counting) < LEAST_JOINT_PAIRS else counting
 
     def observation_of(
@@ -149,13 +146,13 @@ class ObservationFile:
         ``sigma`` is the option for the estimated noise of the pairs.
         """
         pairs = self.usable_pairs(marks)
-        points = self.model.points_of(pairs)
+        points, model = marks.points_of(pairs), marks.model
         options = {**(sigma or {})}
-        if self.stretch_sigma is not None:
+        if model.shape.learned is None:
             options["stretch_sigma"] = self.stretch_sigma
         if marks.photo:
             options["image"] = True
-        prior = self.focal_prior
+        prior, category = self.focal_prior, model.shape.category
         if prior != self.photo.likely_focal:
             options["focal_prior"] = None if prior is None else asdict(prior)
         depths = np.array([np.nan if pair.depth is None else pair.depth for pair in pairs])
@@ -165,7 +162,7 @@ class ObservationFile:
         evidence = msgspec.structs.replace(self.stored.evidence, **mask)
         if not has_depths:  # all keypoints with depths may be deleted
             evidence = msgspec.structs.replace(evidence, depth_sigma=None)
-        halves = [self._half(pair) for pair in marks.pairs if pair not in pairs]
+        halves = [_half_of(pair, model) for pair in marks.pairs if pair not in pairs]
         return replace(
             self.stored,
             points_3d=positions_of(points),
@@ -178,26 +175,13 @@ class ObservationFile:
             image=self.photo.path,
             depths=depths if has_depths else None,
             evidence=evidence,
-            model=self.model.path,
+            model=model.path,
             fit_options=options,
-            shape=self._shape_file,
+            # A category stands beside the observation, which then names it alone.
+            shape=self.path.parent / category if category else model.shape.path,
             init=marks.start if len(pairs) < LEAST_JOINT_PAIRS else None,
             draft={"pairs": halves} if halves else None,
         )
-
-    @property
-    def _shape_file(self) -> Path | None:
-        """The shape's file; a category stands beside the observation, which then names it alone."""
-        category = self.shape.category
-        return self.shape.path if category is None else self.path.parent / category
-
-    def _half(self, pair: Pair) -> dict[str, Any]:
-        """Return a pair as the field ``unfinished`` stores it."""
-        fields = {name: getattr(pair, name) for name in ("uv", "sigma", "score", "depth")}
-        if pair.keypoint is not None:
-            point = self.model.registry[pair.keypoint]
-            fields |= {"semantic_id": pair.keypoint, "xyz": point.xyz, "name": point.name}
-        return {name: value for name, value in fields.items() if value is not None}
 
     def _mask_file(self, marks: Marks) -> Path | None:
         """Return the file of the mask, if there is one; writes a drawn mask if necessary."""
@@ -224,13 +208,13 @@ class ObservationFile:
                 return Observation.from_dict(data, folder=self.path.parent)
         return Observation.load(self.path)
 
-    def _warn_of_options(self, stored: Observation) -> None:
+    def _warn_of_options(self, stored: Observation, model: MarkedModel) -> None:
         """Warn of stored options of the fit that the page does not use."""
         options = dict(stored.fit_options)
         if "stretch_sigma" in options or options.get("sigma") is None:
             options.pop("sigma", None)  # estimated by the annotator, or not set
         others = [name for name in options if name not in _OWN_OPTIONS]
-        if stored.shape is not None and self.shape.path is None:
+        if stored.shape is not None and model.shape.path is None:
             others.append(f"shape {stored.shape}")
         if others:
             logger.warning(
@@ -248,13 +232,23 @@ def _fill_missing(values: Iterable[float | None]) -> FloatArray | None:
     return np.array([1.0 if value is None else value for value in listed])
 
 
-def _add_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistry) -> Marks:
+def _half_of(pair: Pair, model: MarkedModel) -> dict[str, Any]:
+    """Return a pair as the field ``unfinished`` stores it."""
+    fields = {name: getattr(pair, name) for name in ("uv", "sigma", "score", "depth")}
+    if pair.keypoint is not None:
+        point = model.registry[pair.keypoint]
+        fields |= {"semantic_id": pair.keypoint, "xyz": point.xyz, "name": point.name}
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def _add_halves(marks: Marks, halves: Sequence[_Half]) -> Marks:
     """Add unfinished pairs to the marks, except pairs of which no half is left."""
+    registry = marks.model.registry
     for half in halves:
         keypoint = half.semantic_id
         if half.xyz is not None or registry.fixed:
             point = ModelKeypoint(half.name or "", half.xyz or (0, 0, 0), keypoint)
-            keypoint = _register(point, registry, marks.keypoints)
+            keypoint = _register(point, marks)
         elif keypoint not in registry or keypoint in marks.keypoints:
             keypoint = None
         if half.uv is not None or keypoint is not None:
@@ -263,13 +257,13 @@ def _add_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistr
     return marks
 
 
-def _add_pairs(marks: Marks, observation: Observation, registry: KeypointRegistry) -> Marks:
+def _add_pairs(marks: Marks, observation: Observation) -> Marks:
     ids, names = observation.ids, observation.names
     columns = (observation.sigma, observation.scores, observation.depths)
     for row, (x, y, z) in enumerate(observation.points_3d.tolist()):
         number = None if ids is None else int(ids[row])
         point = ModelKeypoint("" if names is None else names[row], (x, y, z), number)
-        keypoint = _register(point, registry, marks.keypoints)
+        keypoint = _register(point, marks)
         known = [None if each is None else float(each[row]) for each in columns]
         known = [None if each is None or math.isnan(each) else each for each in known]
         u, v = observation.points_2d[row].tolist()
@@ -277,14 +271,12 @@ def _add_pairs(marks: Marks, observation: Observation, registry: KeypointRegistr
     return marks
 
 
-def _register(
-    point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]
-) -> int | None:
-    """Find a point of an observation file in the registry, or add it; returns its id.
+def _register(point: ModelKeypoint, marks: Marks) -> int | None:
+    """Find a free point of an observation file in the registry, or add it; returns its id.
 
     Returns None if the registry is fixed and has no such point.
     """
-    wanted = point.semantic_id
+    wanted, registry, taken = point.semantic_id, marks.model.registry, marks.keypoints
     if registry.fixed:
         known = registry.same(point)
         return None if known in taken else known

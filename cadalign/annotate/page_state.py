@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import ActionOutcome
-from cadalign.annotate.marks import ObjectShape
+from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.model import box_lines
 from cadalign.annotate.session import Annotation, LiveAlignment, Session
 from cadalign.arrays import FloatArray
@@ -59,7 +59,7 @@ def page_state(
             "evidence": {
                 "mask": None if marks.mask is None else f"{hash(marks.mask) & 0xFFFFFFFF:x}",
                 "photo": marks.photo,
-                "outline": state.shape.has_outline,
+                "outline": state.model.shape.has_outline,
             },
             "pairs": _pairs(state, live),
             "keypoints": [
@@ -73,10 +73,10 @@ def page_state(
             ],
             "shape": _shape(state),
             "model": {
-                "key": state.shape.category or "",
+                "key": state.model.shape.category or "",
                 "is_skeleton": state.model.is_skeleton,
                 "proposed": state.proposed(live),
-                "categories": CATEGORIES if state.can_exchange else (),
+                "categories": CATEGORIES if state.model.can_exchange else (),
             },
             "alignment": _alignment(state, live, is_ready=session.ready),
         }
@@ -93,10 +93,10 @@ def photos_state(session: Session) -> list[dict[str, Any]]:
 
 def _shape(state: Annotation) -> dict[str, Any] | None:
     """Return the shape's category, and its keypoints that the model lacks."""
-    shape = state.shape
+    shape = state.model.shape
     if shape.learned is None:
         return None
-    known = {shape.id_of(point) for _, point in state.model.registry}
+    known = state.model.numbers
     return {
         "category": shape.learned.category,
         "missing": [label for label in shape.ids if label not in known],
@@ -119,7 +119,7 @@ def _pairs(state: Annotation, live: LiveAlignment) -> list[dict[str, Any]]:
         if pair.keypoint is not None:
             point = state.model.registry[pair.keypoint]
             entry["name"], entry["xyz"] = point.name, state.model.cad.to_display(point.xyz).tolist()
-            entry["counts"] = state.shape.id_of(point) is not None
+            entry["counts"] = state.model.shape.id_of(point) is not None
         if pair.complete and live.estimate is not None and next(counting):
             residual = live.estimate.result.residuals[row]
             entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
@@ -137,7 +137,7 @@ def _alignment(state: Annotation, live: LiveAlignment, *, is_ready: bool) -> dic
     return {
         "status": "done",
         "message": "",
-        "facts": facts_of(live, state.shape, prior=state.file.stretch_sigma),
+        "facts": facts_of(live, state.model.shape, prior=state.file.stretch_sigma),
         "notes": [
             note.replace("views[0]", state.photo.path.name) for note in notes_of(state, live)
         ],
@@ -150,27 +150,26 @@ def _alignment(state: Annotation, live: LiveAlignment, *, is_ready: bool) -> dic
 def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
     """Return box and edges of the model, and unmarked keypoints of a learned shape."""
     assert live.estimate is not None
-    assert live.wireframe is not None
-    result, shape = live.estimate.result, state.shape
+    result = live.estimate.result
     camera, alignment = result.camera, result.alignment
-    lines = live.wireframe.project(camera, alignment), box_lines(result.bounds, camera, alignment)
+    lines = live.lines, box_lines(result.bounds, camera, alignment)
     edges, box = (_round(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
     unmarked, regions = [], []
-    if shape.learned is not None:
-        registry, used = state.model.registry, state.marks.keypoints
-        free = {shape.id_of(point) for number, point in registry if number not in used}
+    if state.model.shape.learned is not None:
+        numbers, used = state.model.numbers, state.marks.keypoints
+        free = {label for label, number in numbers.items() if number not in used}
         in_camera = alignment.apply(result.points_3d)
         known = np.array([label in free for label in result.ids], dtype=bool)
         rows = np.flatnonzero(known & camera.sees(in_camera))
         pixels, covariances = camera.project(in_camera[rows]), result.points_cam_covariance
-        number_of: dict[Any, int] = {shape.id_of(point): number for number, point in registry}
         unmarked = [
-            {"keypoint": number_of[result.ids[row]], "uv": uv}
+            {"keypoint": numbers[result.ids[row]], "uv": uv}
             for row, uv in zip(rows, np.round(pixels, 1).tolist(), strict=True)
         ]
         if covariances is not None:
             places = camera.projected_covariances(in_camera[rows], covariances[rows])
-            regions = [_close(region) for region in confidence_regions(pixels, places)]
+            curves = confidence_regions(pixels, places)
+            regions = _round(np.concatenate([curves, curves[:, :1]], axis=1))
     return {"lines": edges, "box": box, "unmarked": unmarked, "regions": regions}
 
 
@@ -178,11 +177,6 @@ def _round(paths: FloatArray) -> list[list[float]]:
     """Round paths (k, n, 2) to 0.1 px, and flatten each to u1, v1, u2, v2, ..."""
     rounded: list[list[float]] = np.round(paths, 1).reshape(len(paths), -1).tolist()
     return rounded
-
-
-def _close(region: FloatArray) -> list[float]:
-    """Close a path (n, 2), so that it ends at its start."""
-    return _round(np.concatenate([region, region[:1]])[None])[0]
 
 
 def evidence_labels(observation: Observation) -> list[str]:
@@ -228,12 +222,12 @@ def facts_of(
 def notes_of(state: Annotation, live: LiveAlignment) -> list[str]:
     """List assumptions, pairs that do not count, alternative alignments and warnings."""
     assert live.estimate is not None
-    result, shape = live.estimate.result, state.shape
+    result, shape = live.estimate.result, state.model.shape
     notes = [live.estimate.message] if live.estimate.message else []
     idle = int((~live.counts).sum())
     if idle:
         subject = f"{idle} pair{'s do' if idle > 1 else ' does'} not count"
-        known = shape.knows(state.model.points_of(state.marks.complete_pairs))
+        known = shape.knows(state.marks.points_of(state.marks.complete_pairs))
         reason = "the mask alone aligns until there are 3"
         if shape.learned is not None and not known.all():
             reason = f"the shape of {shape.learned.category} has no such keypoint"
@@ -254,7 +248,7 @@ def _extent(
     result: Result, axis: str, shape: ObjectShape, *, prior: float | None
 ) -> tuple[str, str]:
     """Return the length of the object along an axis, or its stretch if that has a prior."""
-    row, average = "xyz".index(axis), shape.average
+    row, average = "xyz".index(axis), "the model" if shape.learned is None else "the average"
     value = stretch = float(result.stretch[row])
     relative = 0.0 if result.std is None else float(result.std.scale[row])
     if prior is None:

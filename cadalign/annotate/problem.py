@@ -15,7 +15,6 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.marks import ObjectShape
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.arrays import FloatArray
 from cadalign.batch.observation_fit import model_of, views_of
@@ -61,27 +60,6 @@ FitRows = Callable[[Rows, bool], Result]
 
 
 @dataclass(frozen=True, eq=False)
-class Priors:
-    """Prior knowledge of an object: its shape, mesh and focal length.
-
-    ``focal`` is the value that is assumed if the focal length cannot be estimated, ``focal_prior``
-    its prior.
-    """
-
-    shape: ObjectShape
-    mesh: Mesh
-    focal: float = 0.0
-    focal_prior: FocalPrior | None = None
-
-    def model_for(self, observation: Observation) -> Model | ShapeModel:
-        """The model that `cadalign fit` aligns to the observation."""
-        if self.shape.learned is not None:
-            return self.shape.learned
-        options = FitOptions(stretch_sigma=observation.fit_options.get("stretch_sigma"))
-        return model_of(observation, options=options, mesh=self.mesh)
-
-
-@dataclass(frozen=True, eq=False)
 class LiveEstimate:
     """An alignment of the marks; ``message`` states its additional assumption.
 
@@ -109,17 +87,28 @@ class LiveProblem:
     init: Alignment | None = None
 
     @classmethod
-    def make(cls, known: Priors, observation: Observation) -> LiveProblem:
-        """Build the problem of an observation and its options."""
-        model, has_photo = known.model_for(observation), "image" in observation.fit_options
+    def make(
+        cls,
+        learned: ShapeModel | None,
+        mesh: Mesh,
+        observation: Observation,
+        focal: float = 0.0,
+        focal_prior: FocalPrior | None = None,
+    ) -> LiveProblem:
+        """Build the problem of an observation and its options.
+
+        ``focal`` is assumed if the focal length is unknown and cannot be estimated.
+        """
+        options = FitOptions(stretch_sigma=observation.fit_options.get("stretch_sigma"))
+        model = learned or model_of(observation, options=options, mesh=mesh)
         estimates_focal = not observation.camera.focal_known
         if estimates_focal:
-            observation = replace(observation, camera=observation.camera.replace_focal(known.focal))
-        (view,) = views_of(observation, model, with_photos=has_photo)
+            observation = replace(observation, camera=observation.camera.replace_focal(focal))
+        (view,) = views_of(observation, model, with_photos="image" in observation.fit_options)
         states_noise = observation.sigma is not None and not observation.is_plain
-        estimates_noise = not (known.shape.learned or states_noise) and bool(len(view.keypoint_ids))
-        focal = estimates_focal, known.focal_prior
-        return cls(model, view, observation.size, estimates_noise, *focal, observation.init)
+        estimates_noise = not (learned or states_noise) and bool(len(view.keypoint_ids))
+        how = estimates_noise, estimates_focal, focal_prior
+        return cls(model, view, observation.size, *how, observation.init)
 
     def estimate(self) -> LiveEstimate:
         """Align with as few assumptions as possible; raises a CadalignError if that fails."""

@@ -17,14 +17,14 @@ from cadalign.annotate.files import (
     observation_file,
     refuse_collisions,
 )
-from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel, positions_of
-from cadalign.annotate.model import Lines, MarkedModel, open_model
+from cadalign.annotate.keypoints import ObjectShape, positions_of
+from cadalign.annotate.marks import History, Marks, Pixel
+from cadalign.annotate.model import MarkedModel, open_model
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS, ObservationFile
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
-from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors, warm_up
+from cadalign.annotate.problem import LiveEstimate, LiveProblem, warm_up
 from cadalign.annotate.skeleton import next_row, open_skeleton
-from cadalign.arrays import BoolArray
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
 from cadalign.estimation.result import Result
 from cadalign.io.observation import Observation, read_camera
@@ -42,8 +42,8 @@ class LiveAlignment:
     message: str = ""
     counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
     """Mask (n,) of the complete pairs that count."""
-    wireframe: Lines | None = None
-    """Lines of the model before the stretch, warped to a learned shape."""
+    lines: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    """Visible lines (k, 2, 2) of the object [px]."""
 
     @property
     def result(self) -> Result | None:
@@ -80,8 +80,8 @@ class Annotation:
     """True if it was saved before the solvers were ready, without the estimated noise."""
     live: tuple[Marks, LiveAlignment] | None = None
     """The last alignment, with its marks."""
-    skipped: set[int] = field(default_factory=set)
-    """Keypoints that are not proposed any more."""
+    skipped: set[str] = field(default_factory=set)
+    """Names of keypoints that are not proposed any more."""
     _estimated: tuple[str, LiveEstimate] | None = None  # with a key of its input
 
     @property
@@ -96,13 +96,8 @@ class Annotation:
 
     @property
     def model(self) -> MarkedModel:
-        """The model of the session."""
-        return self.file.model
-
-    @property
-    def shape(self) -> ObjectShape:
-        """The shape of the session's objects."""
-        return self.file.shape
+        """The model whose keypoints are marked."""
+        return self.marks.model
 
     def record(self, marks: Marks) -> None:
         """Set the current marks."""
@@ -110,32 +105,24 @@ class Annotation:
 
     def proposed(self, live: LiveAlignment) -> int | None:
         """The keypoint of a skeleton to mark next; None for a model, or if there is none."""
-        learned = self.shape.learned
-        if learned is None or not self.model.is_skeleton:
+        if not self.model.is_skeleton:
             return None
-        numbers = [number for number, _ in self.model.registry]
-        rows = [row for row, number in enumerate(numbers) if number in self.marks.keypoints]
-        done = self.marks.keypoints | self.skipped
-        left = [row for row, number in enumerate(numbers) if number not in done]
+        points, used = [point for _, point in self.model.registry], self.marks.keypoints
+        rows = [row for row, point in enumerate(points) if point.semantic_id in used]
+        marked = {points[row].name for row in rows}
+        left = [row for row, point in enumerate(points) if point.name not in marked | self.skipped]
         # A part that was skipped and has no mark, such as an armrest, is likely absent.
-        part_of = {number: point.name.split(",")[0] for number, point in self.model.registry}
-        absent = {part_of[number] for number in self.skipped}
-        absent -= {part_of[number] for number in self.marks.keypoints}
-        likely = [row for row in left if part_of[numbers[row]] not in absent]
+        absent = set(map(_part_of, self.skipped)) - set(map(_part_of, marked))
+        likely = [row for row in left if _part_of(points[row].name) not in absent]
         for group in (likely, left):
-            row = next_row(learned.mean[: len(numbers)], rows, group, live.result)
+            row = next_row(positions_of(points), rows, group, live.result)
             if row is not None:
-                return numbers[row]
+                return points[row].semantic_id
         return None
-
-    @property
-    def can_exchange(self) -> bool:
-        """True if the category of the object can be exchanged."""
-        return self.model.is_skeleton and self.shape.category is not None
 
     def exchange_shape(self, shape: ObjectShape) -> None:
         """Mark the keypoints of another shape; pairs of equal names stay, others lose theirs."""
-        model, before, marks = open_skeleton(shape), self.model.registry, self.marks
+        model, marks, before = open_skeleton(shape), self.marks, self.model.registry
         changed = [
             each
             if each.keypoint is None
@@ -143,9 +130,7 @@ class Annotation:
             for each in marks.pairs
         ]
         kept = [each for each in changed if each.uv is not None or each.keypoint is not None]
-        self.file.model, self.file.shape = model, shape
-        self.history = History(replace(marks, pairs=tuple(kept), start=None))
-        self.skipped.clear()
+        self.record(replace(marks, model=model, pairs=tuple(kept), start=None))
 
     @property
     def mask(self) -> BoolArray:
@@ -173,29 +158,27 @@ class Annotation:
         return self.live[1]
 
     def _align(self) -> LiveAlignment:
-        file, marks, shape = self.file, self.marks, self.shape
+        file, marks, shape = self.file, self.marks, self.model.shape
         observation, counting = file.observation_of(marks), file.usable_pairs(marks)
         counts = np.array([pair in counting for pair in marks.complete_pairs], dtype=bool)
         if missing := missing_text(counts, shape, observation):
             return LiveAlignment(message=missing)
-        estimate, lines = self._estimate(observation), self.model.cad.wireframe
-        if shape.learned is not None:  # move known keypoints to their estimates
-            result = estimate.result
-            registry = self.model.registry
-            own: dict[Any, ModelKeypoint] = {shape.id_of(point): point for _, point in registry}
-            rows = [row for row, label in enumerate(result.ids) if label in own]
-            source = positions_of(own[result.ids[row]] for row in rows)
-            lines = lines.warp(source, result.points_3d[rows], result.bounds)
-        return LiveAlignment(estimate, "", counts, lines)
+        estimate = self._estimate(observation)
+        return LiveAlignment(estimate, "", counts, self.model.lines(estimate.result))
 
     def _estimate(self, observation: Observation) -> LiveEstimate:
         depends = replace(observation, draft=None).to_dict()
         key = json.dumps([depends, hash(self.marks.mask)])  # a mask's path may stay the same
         if self._estimated is None or self._estimated[0] != key:
-            mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
-            known = Priors(self.shape, mesh, likely, self.file.focal_prior)
-            self._estimated = key, LiveProblem.make(known, observation).estimate()
+            known = self.model.shape.learned, self.model.cad.scene.mesh
+            focal = self.photo.likely_focal.focal, self.file.focal_prior
+            self._estimated = key, LiveProblem.make(*known, observation, *focal).estimate()
         return self._estimated[1]
+
+
+def _part_of(name: str) -> str:
+    """Name of the part that a keypoint belongs to: "leg" of "leg, front left, bottom"."""
+    return name.split(",")[0]
 
 
 @dataclass(eq=False)
@@ -203,7 +186,6 @@ class Session:
     """All state of an annotator; safe to use from several threads."""
 
     model: MarkedModel
-    shape: ObjectShape = field(default_factory=ObjectShape)
     photos: list[Annotation] = field(default_factory=list)
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
 
@@ -214,14 +196,14 @@ class Session:
     def warm_up(self) -> None:
         """Compile or load the solvers, and prepare the model, unless the session has ``ended``."""
         try:
-            joint = self.shape.learned is not None or any(
+            joint = self.model.shape.learned is not None or any(
                 not each.file.observation_of(each.marks).is_plain
                 for each in self.photos
                 if each.marks.complete_pairs
             )
             warm_up(joint=joint)
             if not self.ended.is_set():
-                _ = self.model.cad.scene.caster, self.model.cad.wireframe
+                _ = self.model.cad.scene.caster, self.model.cad.creases
         finally:  # an error here occurs again, and is reported, when the user aligns
             self.ready = True
             with self.lock:
@@ -320,13 +302,13 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
         model = open_model(options.model, path.parent, keypoints=options.keypoints, shape=shape)
     size = first.width, first.height
     given = None if options.camera is None else read_camera(options.camera, size=size)
-    session = Session(model, shape)
+    session = Session(model)
     for photo, path in files:
         camera = camera_of(photo, given)
         if options.focal is not None:
             camera = camera.replace_focal(options.focal)
-        file = ObservationFile(path, photo, model, shape)
-        marks = file.read(camera, up_axis=up_axis)
+        file = ObservationFile(path, photo)
+        marks = file.read(model, camera, up_axis=up_axis)
         session.photos.append(Annotation(file, History(marks)))
     return session
 

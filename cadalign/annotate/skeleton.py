@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.marks import KeypointRegistry, ObjectShape
-from cadalign.annotate.model import (
-    ClickableModel,
-    Lines,
-    MarkedModel,
-    project_lines,
-    split_lines,
-)
-from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
+from cadalign.annotate.model import ClickableModel, MarkedModel
+from cadalign.arrays import FloatArray
+from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.estimation.result import Result
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.shapes.model import ShapeModel
 
 _BAR, _JOINT = 0.006, 0.011  # radii [diagonals]
-_PIECE = 1 / 24  # longest line that is drawn as a whole [diagonals]
 _COLOR = (0.05, 0.09, 0.16, 1.0)
 _OCTAHEDRON = np.array([[x, y, z] for x in (0, 1) for y in (2, 3) for z in (4, 5)], dtype=np.int64)
 _PRISM = np.array(
@@ -36,43 +25,20 @@ _PRISM = np.array(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class SkeletonLines:
-    """Lines between keypoints; nothing hides them."""
-
-    points: FloatArray  # (m, 3) [model units]
-    rows: IntArray  # (k, 2) of the points
-    piece: float  # length of a line in the photo [model units]
-
-    @property
-    def creases(self) -> FloatArray:
-        """The lines, (k, 2, 3) float [model units]."""
-        return self.points[self.rows]
-
-    def warp(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> SkeletonLines:
-        """Move the keypoints ``source`` (m, 3) to ``target`` (m, 3)."""
-        gaps = np.linalg.norm(self.points[:, None] - source[None], axis=2)
-        return replace(self, points=target[gaps.argmin(axis=1)])
-
-    def project(self, camera: Camera, alignment: Alignment) -> FloatArray:
-        """Project the lines to pixels (k, 2, 2)."""
-        return project_lines(split_lines(self.creases, self.piece), camera, alignment)
-
-
 class Skeleton(ClickableModel):
     """The mean keypoints of a learned shape with bars between them; only keypoints are clicked."""
 
     missed = "Click on one of the keypoints, the white points."
 
     def __init__(self, shape: ShapeModel) -> None:
-        self._points = shape.mean[: len(shape.ids)]
-        self._rows = np.array(shape.lines, dtype=np.int64).reshape(-1, 2)
-        super().__init__(_mesh(self._points, self._rows, shape.category))
+        points = shape.mean[: len(shape.ids)]
+        self._lines = points[np.array(shape.lines, dtype=np.int64).reshape(-1, 2)]
+        super().__init__(_mesh(points, self._lines, shape.category))
 
-    @cached_property
-    def wireframe(self) -> Lines:
-        """The bars' axes."""
-        return SkeletonLines(self._points, self._rows, _PIECE * self.diagonal)
+    @property
+    def creases(self) -> FloatArray:
+        """The bars' axes, (k, 2, 3) float [model units]."""
+        return self._lines
 
     def pick(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> None:
         """Pick nothing: there is no surface."""
@@ -83,14 +49,9 @@ def open_skeleton(shape: ObjectShape) -> MarkedModel:
     learned = shape.learned
     assert learned is not None
     registry = KeypointRegistry(fixed=True)
-    names = learned.names or [
-        label if isinstance(label, str) else f"keypoint {label}" for label in learned.ids
-    ]
-    for row, (label, name) in enumerate(zip(learned.ids, names, strict=True)):
-        x, y, z = learned.mean[row].tolist()
-        number = row if isinstance(label, str) else label
-        registry.add(ModelKeypoint(name, (x, y, z), number))
-    return MarkedModel(None, Skeleton(learned), registry, Path())
+    for point in ModelKeypoints.from_shape(learned).keypoints:
+        registry.add(point)
+    return MarkedModel(None, Skeleton(learned), registry, shape, Path())
 
 
 def next_row(
@@ -117,13 +78,13 @@ def next_row(
     return int(rows[gaps.argmax()])
 
 
-def _mesh(points: FloatArray, rows: IntArray, name: str) -> Mesh:
-    """Make an octahedron at each point (m, 3), and a bar along each line (k, 2)."""
+def _mesh(points: FloatArray, lines: FloatArray, name: str) -> Mesh:
+    """Make an octahedron at each point (m, 3), and a bar along each line (k, 2, 3)."""
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     corners = np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]
     parts = [(point + _JOINT * size * corners, _OCTAHEDRON) for point in points]
     turns = np.linspace(0, 2 * np.pi, 6, endpoint=False)[:, None]
-    for start, end in points[rows]:
+    for start, end in lines:
         along = end - start
         side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
         if not side.any():  # the keypoints coincide

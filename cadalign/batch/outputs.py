@@ -27,7 +27,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import AbortError, Columns, Row
 from cadalign.export.results import RESULT_COLUMNS, row_of
-from cadalign.geometry.alignment import Box
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import write_whole
 from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
@@ -115,12 +115,18 @@ def draw_fit(
 
     def draw_photo() -> None:
         if seen.image is not None:
-            box = None if result is None else Box.from_model(result.bounds, result.alignment)
-            how = partial(write_pictures, observed=seen.points_2d, est_box=box)
+            drawn: dict[str, Any] = {"observed": seen.points_2d}
+            if result is not None:
+                points = result.alignment.apply(result.points_3d)
+                drawn |= {"est_box": result.box, "skeleton": points[result.lines]}
+            how = partial(write_pictures, **drawn)
             write_picture(how, folder, stem, read_image(seen.image, camera), camera)
 
     def draw_model() -> None:
         mesh = None if result is None else mesh_of(seen, result)
+        if mesh is None and result is not None and len(result.lines):
+            # The preview of triangles without area is lines.
+            mesh = Mesh(result.points_3d, result.lines[:, [0, 1, 1]])
         if mesh is not None:
             write_picture(write_preview, folder.previews / f"{stem}.json", mesh)
 

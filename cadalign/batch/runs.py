@@ -24,7 +24,7 @@ from cadalign.batch.outputs import (
 )
 from cadalign.batch.sources import ObservationTask, ObservationTasks
 from cadalign.datasets.image_keypoints import ImageKeypoints, find_photo, observe_keypoints
-from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError, quote, require_kind
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
@@ -86,16 +86,7 @@ class FitRunOptions(ExperimentOptions):
             return None
         from cadalign.shapes.model import open_shape  # takes time to import
 
-        shape = open_shape(self.estimate.shape)
-        named = isinstance(shape.ids[0], str)
-        names = shape.names or map(str, shape.ids)
-        rows = zip(names, shape.ids, shape.components[0].mean.tolist(), strict=False)
-        return ModelKeypoints(
-            tuple(
-                ModelKeypoint(name, tuple(xyz), None if named else int(label))
-                for name, label, xyz in rows
-            )
-        )
+        return ModelKeypoints.from_shape(open_shape(self.estimate.shape))
 
     def estimate_of(self, seen: Observation, where: str) -> Estimate:
         """Align an observation; raises CadalignError if that fails."""

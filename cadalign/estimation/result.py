@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, is_number
+from cadalign.arrays import BoolArray, FloatArray, IntArray, is_number
 from cadalign.errors import InputError, quote
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
@@ -268,6 +268,11 @@ class Result:
         return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
 
     @property
+    def lines(self) -> IntArray:
+        """Lines (k, 2) of the shape's skeleton, as rows of ``points_3d``; usually none."""
+        return np.array(getattr(self.model, "lines", ()), dtype=np.int64).reshape(-1, 2)
+
+    @property
     def box(self) -> Box:
         """The object's box in the first camera's frame."""
         return Box.from_model(self.bounds, self.alignment)
@@ -358,7 +363,7 @@ class Result:
             The photo; grey by default.
         mesh : Mesh, optional
             As for `mesh`, drawn shaded with its outline; default: the model's mesh, if it has one.
-            Without a mesh the box shows ``bounds``.
+            Without a mesh the box shows ``bounds``, and ``lines`` are drawn.
         view : int
             Number of the view to draw.
         axes : matplotlib.axes.Axes, optional

@@ -10,10 +10,10 @@ import pytest
 from support.problems import problem_of
 
 from cadalign import Camera, fit
-from cadalign.annotate.marks import ObjectShape
+from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of
-from cadalign.annotate.problem import LiveEstimate, LiveProblem, Priors
+from cadalign.annotate.problem import LiveEstimate, LiveProblem
 from cadalign.annotate.session import LiveAlignment, missing_text
 from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.mesh import Mesh
@@ -44,7 +44,7 @@ def estimate_of(
         ids=np.arange(len(problem.points_3d)),
         fit_options={"stretch_sigma": stretch},
     )
-    return LiveProblem.make(Priors(STRETCHED, BOX, focal=500.0), observation).estimate()
+    return LiveProblem.make(None, BOX, observation, focal=500.0).estimate()
 
 
 def live_of(problem: SimulatedProblem, **options: Any) -> LiveAlignment:
@@ -93,7 +93,7 @@ def test_clicks_without_a_stated_noise_have_it_found_beside_other_evidence() -> 
     for sigma, estimates_noise in ((None, True), (np.full(8, 2.0), False)):
         noted = {"sigma": sigma, "ids": np.arange(8), "evidence": upright}
         seen = Observation(*given, **noted)
-        assert LiveProblem.make(Priors(STRETCHED, BOX), seen).estimates_noise == estimates_noise
+        assert LiveProblem.make(None, BOX, seen).estimates_noise == estimates_noise
 
 
 def test_pairs_that_leave_the_stretch_open_have_its_prior() -> None:

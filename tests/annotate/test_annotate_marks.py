@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign.annotate.marks import History, KeypointRegistry, Marks, Pair
+from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
+from cadalign.annotate.marks import History, Marks, Pair
+from cadalign.annotate.skeleton import open_skeleton
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 
 CAMERA = Camera.from_size(640, 480)
-EMPTY = Marks(CAMERA)
+EMPTY = Marks(CAMERA, open_skeleton(ObjectShape.open(Path("mug"))))
 
 
 def test_either_half_may_come_first() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, expect
 from support.annotating import opened_page, place_of_pixel, wait
@@ -184,15 +185,19 @@ def test_another_category_keeps_pairs_of_equal_names(photo: Path) -> None:
     assert f"{len(shared)} of {len(shared) + len(own)} pairs stay" in outcome.message
     state = page_state(session, 0)
     assert state["model"]["key"] == "table"
-    assert not state["can_undo"]
     kept = {pair["name"] for pair in state["pairs"] if pair["name"]}
     assert kept == set(shared)
     halves = [pair for pair in state["pairs"] if pair["keypoint"] is None]
     assert sorted(pair["uv"][0] for pair in halves) == sorted(10.0 + ids[name] for name in own)
-    # The observation remembers its category.
+    # The observation remembers its category. Undo restores the one before, with all pairs.
     again = page_state(opened(photo), 0)
     assert again["model"]["key"] == "table"
     assert len(again["pairs"]) == len(state["pairs"])
+    for do, key, names in (("undo", "chair", {*shared, *own}), ("redo", "table", kept)):
+        perform(session, 0, {"do": do})
+        for state in (page_state(session, 0), page_state(opened(photo), 0)):
+            assert state["model"]["key"] == key
+            assert {pair["name"] for pair in state["pairs"] if pair["name"]} == names
     with pytest.raises(CadalignError, match="unknown category 'sofa'"):
         perform(session, 0, {"do": "category", "name": "sofa"})
 
@@ -223,8 +228,27 @@ def test_input_without_model_or_shape_is_refused(
         opened(photo)
 
 
+@pytest.mark.parametrize("width", [1000, 1200, 1366])
+def test_pairs_without_a_model_take_one_line_each(
+    browser: Browser, photo: Path, width: int
+) -> None:
+    session = opened(photo)
+    mark_until(session, 8)
+    perform(session, 0, {"do": "category", "name": "table"})
+    with opened_page(browser, session, width=width, height=700) as page:
+        rows = page.locator(".pairs li")
+        heights = rows.evaluate_all("all => all.map((each) => each.offsetHeight)")
+        assert max(heights) < 34
+        names = "all => all.map((each) => [each.clientWidth, each.scrollWidth])"
+        widths = page.locator(".pairs .name").evaluate_all(names)
+        assert len(widths) >= 3
+        assert all(given >= needed for given, needed in widths)
+        choices = page.locator(".pairs select")
+        assert min(choices.evaluate_all("all => all.map((each) => each.offsetWidth)")) > 200
+
+
 @pytest.mark.long
-def test_a_chair_from_nothing_to_a_fitted_box(browser: Browser, photo: Path) -> None:
+def test_a_chair_from_nothing_to_an_exported_box(browser: Browser, photo: Path) -> None:
     """Clicks alone: the proposed keypoints, then an estimated one is taken, another dragged."""
     session, pixels = opened(photo, focal=900.0), chair_pixels()
     session.warm_up()
@@ -274,3 +298,8 @@ def test_a_chair_from_nothing_to_a_fitted_box(browser: Browser, photo: Path) -> 
     shape = ShapeModel.pretrained("chair")
     size = np.ptp(found.bounds, axis=0) * found.alignment.scale
     np.testing.assert_allclose(size, np.ptp(shape.mean[-2:], axis=0), rtol=0.3)
+    assert main(["export", str(out / "fit.json"), "--to", str(out / "chair.glb")]) == 0
+    scene = trimesh.load(out / "chair.glb")
+    place, name = scene.graph["model_0"]
+    lengths = np.ptp(scene.geometry[name].bounds, axis=0) * np.linalg.norm(place[:3, :3], axis=0)
+    np.testing.assert_allclose(lengths, size, rtol=1e-5)

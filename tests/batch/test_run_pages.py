@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +14,14 @@ import pytest
 from playwright.sync_api import Browser, expect
 from support.pages import Opened, embedded_payload, watched
 
-from cadalign import Alignment, Camera, Observation
+from cadalign import Alignment, Camera, Observation, ShapeModel
 from cadalign.batch import FitRunOptions, ObservationFit, run_many
 from cadalign.datasets import write_sample_dataset
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.images import read_photo, write_image
+from cadalign.render import look_at
 from cadalign.report import write_report
 
 CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
@@ -104,3 +106,34 @@ def test_failed_fits_show_their_photos_and_keypoints(tmp_path: Path, opened: Ope
         for each in shown:
             middle = read_photo(each)[5, 5].astype(int)
             assert np.abs(middle - (40, 140, 90)).max() < 12
+
+
+@pytest.mark.long
+def test_a_category_without_meshes_is_shown_as_its_skeleton(tmp_path: Path, opened: Opened) -> None:
+    photo, mug = tmp_path / "photo.png", ShapeModel.pretrained("mug")
+    write_image(photo, np.full((480, 640, 3), (40, 140, 90), dtype=np.uint8))
+    points = mug.mean[: len(mug.ids)]
+    turn = look_at(azimuth=35, elevation=30, distance=2)
+    pixels = CAMERA.project(turn.apply(points))
+    seen = Observation(points, pixels, CAMERA, names=mug.names, image=photo)
+    replace(mug, lines=()).save(tmp_path / "plain.shape")
+    thumbs = []
+    for name, shape in (("run", "mug"), ("plain", str(tmp_path / "plain.shape"))):
+        fit(tmp_path / name, [seen], pictures=1, estimate=ObservationFit(shape=Path(shape)))
+        thumbs += [
+            read_photo(each).astype(int) for each in (tmp_path / name / "thumbs").glob("*.webp")
+        ]
+    assert (np.abs(np.diff(thumbs, axis=0)[0]).max(axis=2) > 20).sum() > 200
+    assert not list((tmp_path / "plain" / "previews").iterdir())
+    page = opened(write_report([tmp_path / "run"], tmp_path / "run" / "r.html").as_uri())
+    page.locator(".card").click()
+    wire = page.locator(".overlay .wire.est")
+    drawn = np.array(re.findall(r"-?[\d.]+", wire.get_attribute("d") or ""), dtype=float)
+    ends = pixels[np.array(mug.lines)]
+    either = np.concatenate([ends, ends[:, ::-1]]).reshape(-1, 4)
+    gaps = np.abs(drawn.reshape(-1, 1, 4) - either).max(axis=2)
+    assert sorted(gaps.argmin(axis=1) % len(ends)) == list(range(len(ends)))
+    assert gaps.min(axis=1).max() < 3
+    page.get_by_role("checkbox", name="keypoints").uncheck()
+    expect(wire).to_have_count(0)
+    expect(page.get_by_role("checkbox", name="wireframe")).to_have_count(0)

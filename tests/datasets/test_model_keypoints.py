@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from support.files import TETRAHEDRON, replaced, write_json
 
+from cadalign import ShapeModel
 from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError
 
@@ -61,6 +63,24 @@ def test_annotated_model_is_written(sample_root: Path, tmp_path: Path) -> None:
     assert again == keypoints
     assert again.names == tuple(f"keypoint {number}" for number in ids)
     assert again.ids == tuple(ids)
+
+
+@pytest.mark.parametrize(
+    ("ids", "names", "expected"),
+    [
+        ((3, 5), ("heel", "toe"), [("heel", 3), ("toe", 5)]),
+        ((3, 5), (), [("keypoint 3", 3), ("keypoint 5", 5)]),
+        (("heel", "toe"), (), [("heel", None), ("toe", None)]),
+    ],
+)
+def test_keypoints_of_a_learned_shape_have_its_names_and_numbers(
+    ids: Any, names: Any, expected: Any
+) -> None:
+    mean = [[0, 0, 0], [0, 1, 2]]
+    shape = ShapeModel.from_basis(mean, [mean], [0.1], ids=ids)
+    keypoints = ModelKeypoints.from_shape(replace(shape, names=names))
+    assert list(zip(keypoints.names, keypoints.ids, strict=True)) == expected
+    np.testing.assert_allclose(keypoints.xyz, mean)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign import Box, Camera, Mesh
+from cadalign import Box, Camera, Mesh, ShapeModel, fit
 from cadalign.errors import InputError
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay, look_at, overlay_model
 from cadalign.render.canvas import linear_from_bytes
@@ -21,7 +23,7 @@ from cadalign.render.layers import (
     UNSEEN_COLOR,
     confidence_regions,
 )
-from cadalign.render.overlay import AXIS_COLORS, EST_COLOR, GT_COLOR
+from cadalign.render.overlay import AXIS_COLORS, EST_COLOR, GT_COLOR, draw_result
 
 CAMERA = Camera.from_fov(640, 480, fov_x=50)
 LARGE = Camera.from_fov(1600, 1200, fov_x=50)
@@ -356,3 +358,20 @@ def test_unobserved_keypoints_and_regions_are_drawn():
     on_curve = drawn[200, 400 + 48 : 400 + 51].max()
     assert on_curve > 80
     assert not drawn[200, 380:420].any()
+
+
+def test_the_skeleton_of_a_learned_shape_is_drawn_unless_its_mesh_is():
+    mug = ShapeModel.pretrained("mug")
+    points = mug.mean[: len(mug.ids)]
+    pixels = CAMERA.project(look_at(azimuth=35, elevation=30, distance=2).apply(points))
+    found = replace(fit(points, pixels, CAMERA), model=mug)
+    unlined = replace(found, model=replace(mug, lines=()))
+    drawn, without = (draw_result(_blank(), each) for each in (found, unlined))
+    for start, end in mug.lines:
+        for share in (0.3, 0.5, 0.7):
+            place = share * pixels[start] + (1 - share) * pixels[end]
+            assert _has_color_near(drawn, place, EST_COLOR)
+    lengths = [np.linalg.norm(pixels[start] - pixels[end]) for start, end in mug.lines]
+    assert (without != drawn).any(axis=2).sum() > 0.5 * sum(lengths)
+    meshes = [draw_result(_blank(), each, mesh=CHAIR) for each in (found, unlined)]
+    np.testing.assert_array_equal(*meshes)

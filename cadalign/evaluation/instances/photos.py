@@ -269,7 +269,7 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
-    boxes = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
+    boxes: dict[str, Any] = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
     write_pictures(folder, stem, photo, camera, observed=sighting.input.points_2d, **boxes)
     if scene is not None:
         write_preview(folder.previews / f"{stem}.json", scene.mesh)

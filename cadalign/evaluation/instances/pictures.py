@@ -45,11 +45,13 @@ def write_pictures(
     observed: FloatArray,
     gt_box: Box | None = None,
     est_box: Box | None = None,
+    skeleton: npt.ArrayLike = (),
 ) -> None:
     """Write the pictures of an instance, named ``stem``, to a run's folder.
 
     The folder's ``pictures`` gets the photo. ``thumbs`` gets the part around the object and its
-    keypoints ``observed`` (n, 2) [px], with the true and the estimated box.
+    keypoints ``observed`` (n, 2) [px], with the true and the estimated box, and the lines of a
+    ``skeleton`` (s, 2, 3) in the camera frame.
     """
     small, near = shrink_photo(photo, camera)
     box = gt_box or est_box
@@ -59,8 +61,8 @@ def write_pictures(
     if not len(points):
         points = np.array([[0, 0], [near.width, near.height]], dtype=float)
     crop, crop_camera = crop_photo(small, near, points)
-    boxes: dict[str, Any] = {"gt_box": gt_box, "est_box": est_box}
-    thumb = draw_overlay(crop, crop_camera, axes=False, legend=False, **boxes)
+    drawn: dict[str, Any] = {"gt_box": gt_box, "est_box": est_box, "skeleton": skeleton}
+    thumb = draw_overlay(crop, crop_camera, axes=False, legend=False, **drawn)
     write_webp(folder.pictures / f"{stem}.webp", small)
     write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
 

@@ -37,8 +37,8 @@ export class Panel {
   makeCategory() {
     const change = () => this.handlers.act({ do: "category", name: this.category.value });
     this.category = h("select", { onchange: change });
-    const title = "Pairs of keypoints with the same name stay. It cannot be undone.";
-    this.categories = h("label", { title }, "Category in this photo: ", this.category);
+    const title = "Of the object in this photo. Pairs of keypoints with the same name stay";
+    this.categories = h("label", { title }, "Category: ", this.category);
     return this.categories;
   }
 
@@ -97,7 +97,7 @@ export class Panel {
     const options = this.free.map(({ keypoint, name }) => h("option", { value: keypoint }, name));
     const act = () => this.handlers.act({ do: "place_keypoint", keypoint: Number(choice.value), pair });
     const label = "Keypoints of the model that are not marked";
-    const choice = h("select", { "aria-label": label, onchange: act }, h("option", { value: "" }, "choose a keypoint"), options);
+    const choice = h("select", { "aria-label": label, onchange: act }, h("option", { value: "" }, "click the model or choose"), options);
     return choice;
   }
 
@@ -126,16 +126,19 @@ export class Panel {
         "data-key": `select ${number}`,
       }),
       this.name(pair),
-      h("span", { class: off === null ? "number" : "number wrong" }, uv === null ? "click the photo" : length === null ? "" : `${length.toFixed(1)} px`),
-      keypoint !== null && uv !== null ? does("↺", "Repick the model point of", "release", repick) : h("span"),
+      uv === null && h("span", { class: "number pending" }, "click the photo"),
+      uv !== null && keypoint !== null && [
+        h("span", { class: off === null ? "number" : "number wrong" }, length === null ? "" : `${length.toFixed(1)} px`),
+        does("↺", "Repick the model point of", "release", repick),
+      ],
       does("✕", "Delete", "delete", () => act({ do: "delete", pair: number })),
       pair.counts || !shape?.category ? null : this.identity(pair, shape),
     );
   }
 
   name({ pair, keypoint, name }) {
-    if (keypoint === null) return h("span", {}, "click the model", this.free.length > 0 && [" or ", this.choice(pair)]);
-    if (this.isFixed) return h("span", { title: name }, name);
+    if (keypoint === null) return h("span", { class: "choice" }, this.free.length ? this.choice(pair) : "click the model");
+    if (this.isFixed) return h("span", { class: "name", title: name }, name);
     return h("input", {
       value: name,
       maxLength: 80,

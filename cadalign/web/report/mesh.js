@@ -22,8 +22,11 @@ export function unpackMesh({ lo, step, vertices, faces, edges, wide }) {
   };
 }
 
-/** Vertices as triples, and feature edges as pairs of indices. */
-export function wireOf({ vertices, edges }) {
+/**
+ * Vertices as triples, feature edges as pairs of indices, and the key of their layer: a skeleton,
+ * which has no triangles, belongs to the keypoints.
+ */
+export function wireOf({ vertices, faces, edges }) {
   const points = Array.from({ length: vertices.length / 3 }, (_, i) => [
     vertices[3 * i],
     vertices[3 * i + 1],
@@ -33,5 +36,5 @@ export function wireOf({ vertices, edges }) {
     edges[2 * i],
     edges[2 * i + 1],
   ]);
-  return { points, edges: pairs };
+  return { points, edges: pairs, layer: faces.length ? "w" : "k" };
 }

@@ -48,7 +48,7 @@ export function overlay(exhibit, { picture, estimate, wire = null, layers, label
   ];
   for (const [kind, pose] of poses) {
     if (!pose) continue;
-    if (layers.has("w") && wire) {
+    if (wire && layers.has(wire.layer)) {
       const points = transform(matrixOf(pose), shapeOf(exhibit, pose, wire.points));
       drawing.append(svg("path", { class: `wire ${kind}`, d: pathOf(camera, points, wire.edges) }));
     }

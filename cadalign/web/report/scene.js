@@ -68,13 +68,13 @@ export class Scene3D {
     const color = themeColor(kind);
     const matrix = this.world.clone().multiply(matrix4(matrixOf(pose)));
     if (mesh) {
-      const { points, edges } = mesh.wire;
+      const { points, edges, layer } = mesh.wire;
       const shaped = shapeOf(exhibit, pose, points);
       const solid = new Mesh(geometryOf(shaped, mesh.faces), surface(color, kind));
       // The true model is drawn over the predicted one, so both are visible where they agree.
       solid.renderOrder = kind === "gt" ? 2 : 1;
       this.solids.add(placed(solid, matrix));
-      if (layers.has("w")) {
+      if (layers.has(layer)) {
         this.solids.add(placed(segments(shaped, edges, color, 1), matrix));
       }
     }

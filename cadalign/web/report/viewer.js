@@ -265,7 +265,11 @@ export class Viewer {
   drawSolid(exhibit, mesh, method, fresh) {
     this.solid.hidden = this.layers.hidden = !exhibit;
     if (!exhibit) return;
-    const lacks = { g: !exhibit.gt, k: !exhibit.points_2d?.length };
+    const lacks = {
+      g: !exhibit.gt,
+      k: !exhibit.points_2d?.length,
+      w: mesh?.wire.layer !== "w",
+    };
     for (const box of this.layers.querySelectorAll("input"))
       box.parentElement.hidden = lacks[box.value] ?? false;
     try {

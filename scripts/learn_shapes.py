@@ -20,11 +20,12 @@ import tyro
 
 from cadalign import Example, ShapeModel
 from cadalign.datasets import KeypointNet
-from cadalign.shapes import pretrained
+from cadalign.io.pretrained import CATEGORIES, pretrained_path
 from cadalign.shapes.examples import examples_of, find_other_axes
 
 _LEAST_SHARE = 0.01  # of the models that have a keypoint; fewer are slips of annotators
 NAMES = Path(__file__).with_name("keypoint_names.toml")
+SHAPES = pretrained_path("chair").parent
 
 
 def learn(
@@ -62,12 +63,12 @@ def learn(
 
 def main(
     root: Annotated[Path, tyro.conf.Positional],
-    out: Path = Path(pretrained.__file__).parent,
+    out: Path = SHAPES,
     split: str | None = None,
 ) -> None:
     """Learn and write all shapes."""
     dataset, tables = KeypointNet(root), tomllib.loads(NAMES.read_text(encoding="utf-8"))
-    for category in pretrained.CATEGORIES:
+    for category in CATEGORIES:
         models = dataset.subset(categories=[category], split=split)[category]
         model = learn(examples_of(models, meshes=False), category, tables[category])
         path = out / f"{category}.shape"

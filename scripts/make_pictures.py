@@ -21,6 +21,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.io.images import read_image, write_image
 from cadalign.io.meshes.files import load_mesh
+from cadalign.io.pretrained import CATEGORIES
 from cadalign.render import (
     Angles,
     RaycastRenderer,
@@ -33,7 +34,6 @@ from cadalign.render import (
 from cadalign.render.canvas import ByteImage
 from cadalign.render.overlay import draw_result
 from cadalign.retrieval.folder import draw_match
-from cadalign.shapes.pretrained import CATEGORIES
 from cadalign.shapes.warp import warp_mesh
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

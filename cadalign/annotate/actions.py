@@ -6,7 +6,6 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any, get_type_hints
 
 import msgspec
@@ -16,11 +15,11 @@ from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.marks import Pair
 from cadalign.annotate.photos import ObjectMask, segment_box
 from cadalign.annotate.session import Annotation, Session
-from cadalign.errors import InputError, quote, unknown_name
+from cadalign.errors import InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Finite, ForeignDocument, Index, Point2, Point3, Text, convert
 from cadalign.io.images import read_photo
-from cadalign.shapes.pretrained import CATEGORIES
+from cadalign.io.pretrained import pretrained_path
 
 _FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
 
@@ -114,10 +113,8 @@ def category(state: Annotation, *, name: Text) -> ActionOutcome:
     """Exchange the category of the object in this photo; pairs of equal names stay."""
     if not state.model.can_exchange:
         raise InputError("only categories that come with cadalign can be exchanged", where="name")
-    if name not in CATEGORIES:
-        raise unknown_name("category", name, CATEGORIES, where="name")
     before = len(state.marks.complete_pairs)
-    state.exchange_shape(ObjectShape.open(Path(name)))
+    state.exchange_shape(ObjectShape.open(pretrained_path(name)))
     kept = len(state.marks.complete_pairs)
     text = f"The object in this photo is a {name} now. {kept} of {before} pairs stay."
     if kept < before:

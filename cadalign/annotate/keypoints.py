@@ -11,9 +11,9 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
+from cadalign.io.pretrained import category_of, shape_path
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
-from cadalign.shapes.pretrained import category_of
 
 _LONGEST_NAME = 80
 
@@ -132,8 +132,11 @@ class ObjectShape:
 
     @classmethod
     def open(cls, path: Path | None) -> ObjectShape:
-        """Open a learned shape, if a file is given; raises a CadalignError on failure."""
-        return cls(None if path is None else ShapeModel.open(path), path)
+        """Open a learned shape, if one is named; raises a CadalignError on failure."""
+        if path is None:
+            return cls()
+        path = shape_path(path)
+        return cls(ShapeModel.open(path), path)
 
     @property
     def ids(self) -> tuple[KeypointId, ...]:

@@ -152,7 +152,7 @@ class ObservationFile:
             options["stretch_sigma"] = self.stretch_sigma
         if marks.photo:
             options["image"] = True
-        prior, category = self.focal_prior, model.shape.category
+        prior = self.focal_prior
         if prior != self.photo.likely_focal:
             options["focal_prior"] = None if prior is None else asdict(prior)
         depths = np.array([np.nan if pair.depth is None else pair.depth for pair in pairs])
@@ -177,8 +177,7 @@ class ObservationFile:
             evidence=evidence,
             model=model.path,
             fit_options=options,
-            # A category stands beside the observation, which then names it alone.
-            shape=self.path.parent / category if category else model.shape.path,
+            shape=model.shape.path,
             init=marks.start if len(pairs) < LEAST_JOINT_PAIRS else None,
             draft={"pairs": halves} if halves else None,
         )

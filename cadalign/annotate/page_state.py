@@ -19,8 +19,8 @@ from cadalign.geometry.alignment import (
 )
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
+from cadalign.io.pretrained import CATEGORIES
 from cadalign.render.layers import confidence_regions
-from cadalign.shapes.pretrained import CATEGORIES
 
 _LABELS = {"up": "gravity", "camera_height": "camera height", "cam_from_rig": "camera pose"}
 _LEFT_OPEN = 0.8  # of a prior's standard deviation; beyond it, the pairs add no information

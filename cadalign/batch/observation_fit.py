@@ -21,6 +21,7 @@ from cadalign.io.documents import convert, name_file, name_part
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.io.observation import FitFields, Observation, ObservationChanges
+from cadalign.io.pretrained import shape_path
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
@@ -110,7 +111,7 @@ class ObservationFit:
             if self.shape is not None and self.shape_sigma is not None:
                 what = "has no effect together with a learned shape"
                 raise InputError(what, where="shape_sigma", fix="give one of the two options")
-            shape = self.shape
+            shape = shape if self.shape is None else shape_path(self.shape)
             stored.pop("shape_sigma", None)
         options = stored | given
         # Skips the checks of the observation, which take as long as a linear solver.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,6 +37,7 @@ from cadalign.io.documents import name_file, parse_json
 from cadalign.io.files import as_path, create_folder, read_bytes, write_text
 from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
+from cadalign.io.pretrained import shape_path
 
 LARGEST_CHUNK = 512
 """Maximum number of observations in a chunk, the work of one worker at a time."""
@@ -69,6 +70,9 @@ class FitRunOptions(ExperimentOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        own = self.estimate
+        if own.shape is not None:
+            object.__setattr__(self, "estimate", replace(own, shape=shape_path(own.shape)))
         self.check_least(pictures=0)
 
     @property

@@ -13,7 +13,7 @@ from cadalign.cli.common import answer, create_parent, group_of, say, show_statu
 from cadalign.cli.options import name_flags
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import protect_inputs, refuse_input
-from cadalign.shapes.pretrained import CATEGORIES
+from cadalign.io.pretrained import CATEGORIES
 
 if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel

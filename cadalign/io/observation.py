@@ -23,6 +23,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
     Document,
+    PathText,
     Positive,
     Text,
     convert,
@@ -47,6 +48,7 @@ from cadalign.io.kinds import (
     refuse_other,
     refuse_other_file,
 )
+from cadalign.io.pretrained import category_of, shape_path
 
 
 class FocalPriorFields(Document, omit_defaults=True):
@@ -78,7 +80,7 @@ class ObservationFields(ViewFields, kw_only=True):
     camera: Any = UNSET
     views: Annotated[list[ViewFields], Meta(min_length=1)] | None = None
     model: Path | None = None
-    shape: Path | None = None
+    shape: PathText | None = None
     size: Size | None = None
     object: Text | None = None
     up_axis: Literal["x", "y", "z"] | None = "y"
@@ -226,7 +228,7 @@ class Observation(ObservedImage):
             fit_options=options,
             others=tuple(others),
             size=read.size,
-            shape=read.shape,
+            shape=None if read.shape is None else shape_path(read.shape, folder),
             symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
             init=init,
             object_name=read.object,
@@ -243,7 +245,8 @@ class Observation(ObservedImage):
         data: dict[str, Any] = {"views": written} if self.others else written[0]
         further = {
             "model": self.model and written_path(self.model, folder=folder),
-            "shape": self.shape and written_path(self.shape, folder=folder),
+            "shape": self.shape
+            and (category_of(self.shape) or written_path(self.shape, folder=folder)),
             "object": self.object_name,
             "size": self.size and msgspec.to_builtins(self.size),
             "symmetry": self.symmetry and self.symmetry.to_dict(),

@@ -6,15 +6,15 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
-from cadalign.errors import InputError, quote, unknown_name
+from cadalign.errors import InputError, quote
 from cadalign.io.files import as_path, once_per_file
+from cadalign.io.pretrained import pretrained_path, shape_path
 from cadalign.shapes.basis import component_of_basis
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.outputs import read_shape, write_shape
@@ -29,7 +29,6 @@ from cadalign.shapes.parts import (
     check_ids,
     check_text,
 )
-from cadalign.shapes.pretrained import CATEGORIES, shape_path
 
 if TYPE_CHECKING:
     from cadalign.shapes.examples import Dataset, Example
@@ -297,9 +296,7 @@ class ShapeModel:
         >>> chair.names[4], chair.rows(["seat, front right"]).tolist()
         ('seat, front right', [4])
         """
-        if category not in CATEGORIES:
-            raise unknown_name("category", category, CATEGORIES, where="category")
-        return read_shape(shape_path(Path(category)), cls)
+        return read_shape(pretrained_path(category), cls)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> ShapeModel:
@@ -311,6 +308,8 @@ class ShapeModel:
         ------
         DataError
             If the file is missing, truncated, damaged, of another version, or of another format.
+        InputError
+            If there is neither a file nor a category of that name.
         """
         return read_shape(shape_path(as_path(path)), cls)
 

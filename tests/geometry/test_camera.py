@@ -232,7 +232,7 @@ COLMAP_DATA: dict[str, Any] = {
         (
             {"model": "PINHOLE", "params": []},
             'camera: missing width, height; give {"model", "width", "height", "params"} '
-            "as COLMAP does",
+            "as COLMAP does, or width and height alone if the focal length is unknown",
         ),
         (
             COLMAP_DATA | {"model": "FOV"},

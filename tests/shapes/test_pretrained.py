@@ -1,5 +1,6 @@
 """Learned shapes that come with the package: files, names, and errors."""
 
+import json
 import sys
 import time
 import tomllib
@@ -11,10 +12,13 @@ import pytest
 
 import cadalign
 from cadalign import Alignment, Camera, ShapeModel, View
+from cadalign.batch.observation_fit import ObservationFit
+from cadalign.batch.runs import FitRunOptions
 from cadalign.errors import InputError
+from cadalign.io.observation import Observation
+from cadalign.io.pretrained import CATEGORIES, shape_path
 from cadalign.render import look_at
 from cadalign.retrieval.query import relabel
-from cadalign.shapes.pretrained import CATEGORIES, shape_path
 
 CAMERA = Camera(640, 480, fx=900.0, fy=900.0, cx=319.5, cy=239.5)
 POSE = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 3.0], [1.0, 1.0, 1.0])
@@ -86,6 +90,27 @@ def test_a_file_of_the_name_is_preferred(tmp_path, monkeypatch, caplog):
     own.save("mug")
     assert ShapeModel.open("mug").category == "own"
     assert "this file is used" in caplog.text
+    assert ShapeModel.pretrained("mug").category == "mug"
+
+
+def test_only_a_bare_name_is_a_category(tmp_path):
+    with pytest.raises(InputError, match="unknown shape"):
+        ShapeModel.open(tmp_path / "chair")
+
+
+def test_observations_name_a_category_or_a_file_beside_them(tmp_path):
+    seen = Observation(np.zeros((1, 3)), np.zeros((1, 2)), CAMERA, shape=shape_path("chair"))
+    path = tmp_path / "photo.json"
+    seen.save(path)
+    assert json.loads(path.read_text())["shape"] == "chair"
+    assert Observation.load(path).shape == shape_path("chair")
+    (tmp_path / "chair").write_bytes(b"")
+    assert Observation.load(path).shape == tmp_path / "chair"
+
+
+def test_runs_depend_on_the_content_of_a_category():
+    options = FitRunOptions(estimate=ObservationFit(shape=Path("chair")))
+    assert shape_path("chair") in options.files
 
 
 def test_saving_keeps_every_number(tmp_path):

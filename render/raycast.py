@@ -78,10 +78,23 @@ class RaycastRenderer:
         InputError
             If ``samples`` is not from 1 to 256.
         """
-        check_samples(samples)
+        if not 1 <= samples <= _MAX_SAMPLES:
+            raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
         check_image_size(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         posed = pose_scene(scene, camera, cam_from_model, caster=self._caster(scene))
+        if posed is None:
+            geometry = geometry_of(camera, posed)
+        else:
+            geometry = self._paint(color, posed, samples)
+            darken_corners(color, geometry, posed, self.studio)
+        return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
+
+    def _caster(self, scene: Scene) -> RayCaster:
+        return scene.caster
+
+    def _paint(self, color: ByteImage, posed: PosedScene, samples: int) -> Geometry:
+        """Write the colour without ambient occlusion, (h, w, 4); returns the geometry."""
 
         def shade(
             posed: PosedScene, band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
@@ -90,16 +103,11 @@ class RaycastRenderer:
             color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
 
         # Computed now, since several threads use them.
-        _ = scene.surface, scene.corner_normals
-        geometry = geometry_of(camera, posed, shade)
-        if posed is not None:
-            if samples > 1:
-                self._antialias(color, posed, samples)
-            darken_corners(color, geometry, posed, self.studio)
-        return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
-
-    def _caster(self, scene: Scene) -> RayCaster:
-        return scene.caster
+        _ = posed.scene.surface, posed.scene.corner_normals
+        geometry = geometry_of(posed.camera, posed, shade)
+        if samples > 1:
+            self._antialias(color, posed, samples)
+        return geometry
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
         """Cast more rays through pixels that differ from their neighbours."""
@@ -141,12 +149,6 @@ def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Ge
     """
     check_image_size(camera)
     return geometry_of(camera, pose_scene(scene, camera, cam_from_model))
-
-
-def check_samples(samples: int) -> None:
-    """Refuse a number of rays per pixel that is out of range."""
-    if not 1 <= samples <= _MAX_SAMPLES:
-        raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
 
 
 _Shade = Callable[[PosedScene, Rectangle, FloatArray, FaceArray, FloatArray], None]

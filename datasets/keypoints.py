@@ -5,6 +5,7 @@ Each model's entry is parsed alone, so a malformed entry does not affect other m
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
@@ -53,6 +54,10 @@ class Keypoints:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    def __iter__(self) -> Iterator[tuple[int, FloatArray]]:
+        """Iterate over the (id, position (3,)) of each keypoint."""
+        return zip(self.ids.tolist(), self.xyz, strict=True)
 
 
 class Circle(ForeignDocument, eq=False):

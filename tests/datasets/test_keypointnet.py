@@ -86,6 +86,8 @@ def test_keypoints_and_symmetries_are_read(root):
     keypoints = model.keypoints
     assert len(keypoints) == 4
     assert keypoints.ids.tolist() == [0, 2, 4, 6]
+    assert [label for label, _ in keypoints] == [0, 2, 4, 6]
+    np.testing.assert_array_equal([xyz for _, xyz in keypoints], keypoints.xyz)
     assert keypoints.face_index.tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(keypoints.barycentric.sum(axis=1), 1, atol=1e-15)
     assert model.symmetries.reflections == ((0, 1),)

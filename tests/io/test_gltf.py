@@ -127,6 +127,11 @@ def test_vertices_that_primitives_share_are_not_repeated(tmp_path: Path) -> None
             "short or damaged; get it again",
         ),
         (
+            {"nodes": [{"mesh": -1}]},
+            "cannot be read as a GLTF file (IndexError: list index out of range); the file is cut "
+            "short or damaged; get it again",
+        ),
+        (
             {"accessors": [POSITIONS | {"count": 5}, CORNERS]},
             "accessors[0]: 5 values of 12 bytes do not fit into 48 bytes; the file is cut short "
             "or damaged; get it again",

@@ -56,7 +56,7 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     placed = [
         (primitive, transform)
         for number, transform in _placements(document)
-        for primitive in document["meshes"][number]["primitives"]
+        for primitive in _get_part(document, "meshes", number)["primitives"]
         if _count_faces(document, primitive)
     ]
     if not placed:
@@ -90,8 +90,8 @@ class _GltfFile:
         return read_bytes(self.path.parent / unquote(uri))
 
     def _view(self, number: int) -> memoryview:
-        part = self.document["bufferViews"][number]
-        announced = self.document["buffers"][part["buffer"]]["byteLength"]
+        part = _get_part(self.document, "bufferViews", number)
+        announced = _get_part(self.document, "buffers", part["buffer"])["byteLength"]
         data = self._buffers[part["buffer"]]
         start, length = part.get("byteOffset", 0), part["byteLength"]
         if len(data) < announced or not 0 <= start <= start + length <= len(data):
@@ -101,7 +101,7 @@ class _GltfFile:
 
     def _array(self, number: int) -> npt.NDArray[Any]:
         """Read an accessor's array (n, width); normalized integers become fractions."""
-        accessor = self.document["accessors"][number]
+        accessor = _get_part(self.document, "accessors", number)
         if "sparse" in accessor or "bufferView" not in accessor:
             what = "sparse accessors, and accessors without data, are not supported"
             raise DataError(what, where=f"accessors[{number}]", fix="export the file without them")
@@ -133,11 +133,11 @@ class _GltfFile:
         return material, use
 
     def _texture(self, number: int) -> Texture | None:
-        part = self.document["textures"][number]
+        part = _get_part(self.document, "textures", number)
         source = part.get("extensions", {}).get("EXT_texture_webp", part).get("source")
         if source is None:
             return None
-        image = self.document["images"][source]
+        image = _get_part(self.document, "images", source)
         picture: Path | bytes = b""
         if "uri" not in image:
             picture = bytes(self._view(image["bufferView"]))
@@ -210,9 +210,15 @@ def _check(document: _Part) -> None:
         raise DataError(what, where="extensionsRequired", fix=fix)
 
 
+def _get_part(document: _Part, name: str, number: int) -> _Part:
+    """Return a numbered part of one of the document's lists; negative numbers count nothing."""
+    parts: list[_Part] = document[name]
+    return parts[number if number >= 0 else len(parts)]
+
+
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
     """Yield mesh numbers and transforms, in depth-first order of the scene's nodes."""
-    roots = document["scenes"][document.get("scene", 0)].get("nodes", [])
+    roots = _get_part(document, "scenes", document.get("scene", 0)).get("nodes", [])
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
@@ -221,7 +227,7 @@ def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
             what = "the node has two parents, or is its own ancestor"
             raise DataError(what, where=f"nodes[{number}]", fix="nodes must form a tree")
         seen.add(number)
-        node = document["nodes"][number]
+        node = _get_part(document, "nodes", number)
         transform = parent @ _local_transform(node)
         if "mesh" in node:
             yield node["mesh"], transform
@@ -249,7 +255,7 @@ def _count_faces(document: _Part, primitive: _Part) -> int:
         raise DataError(what, where="meshes", fix="export single triangles")
     if position is None or mode != _TRIANGLES:
         return 0
-    count: int = document["accessors"][primitive.get("indices", position)]["count"]
+    count: int = _get_part(document, "accessors", primitive.get("indices", position))["count"]
     return count // 3
 
 

@@ -223,14 +223,15 @@ def _align_plain(
 def _align_single(problem: Problem, start: float) -> Result:
     """Align a learned shape to one view's keypoints; the time starts at ``start`` [s]."""
     model, view, options = cast(ShapeModel, problem.model), problem.views[0], problem.options
-    prior, init = problem.prior, problem.inits[0]
-    if init is not None:
-        init = rotate_alignment(init, problem.turns[0].T)
-    rows = prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")
+    starts = np.empty((0, 12))
+    if problem.inits[0] is not None:
+        init = rotate_alignment(problem.inits[0], problem.turns[0].T)
+        starts = np.append(init.rotation, init.translation / init.scale.mean())[None]
+    rows = problem.prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")
     weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
     seen = seen_keypoints(view, view.pixels, rows, options)
-    minima, hypotheses = search_view(mixture, seen, _start_of(init))
+    minima, hypotheses = search_view(mixture, seen, starts)
     count, iterations = minima.counts.tolist()
     if not count:
         raise no_pose_error(problem)
@@ -260,12 +261,6 @@ def _align_single(problem: Problem, start: float) -> Result:
         component=component,
         stretched_axes="",
     )
-
-
-def _start_of(init: Alignment | None) -> FloatArray:
-    if init is None:
-        return np.empty((0, 12))
-    return np.append(init.rotation, init.translation / init.scale.mean())[None]
 
 
 def align_batch(

@@ -177,19 +177,18 @@ class Estimate(NamedTuple):
 
 def undo_turns(estimate: Estimate, problem: Problem) -> Estimate:
     """Transform an estimate from turned cameras to the given cameras."""
-    numbers = problem.numbers
-    turns = [problem.turns[number] for number in numbers]
-    first = turns[0]
-    if all(problem.views[n].camera == problem.given[n].camera for n in numbers):
+    given = [problem.given[number].camera for number in problem.numbers]
+    if given == [problem.views[number].camera for number in problem.numbers]:
         return estimate
-    wide = [problem.given[number].camera for number in numbers]
+    turns = [problem.turns[number] for number in problem.numbers]
+    first = turns[0]
     return estimate._replace(
         poses=tuple(map(rotate_alignment, estimate.poses, turns)),
         covariances=tuple(map(rotate_covariance, estimate.covariances, turns)),
         points_cam_covariance=first @ estimate.points_cam_covariance @ first.T,
         cameras=tuple(
-            given if given.is_wide else own
-            for given, own in zip(wide, estimate.cameras, strict=True)
+            camera if camera.is_wide else own
+            for camera, own in zip(given, estimate.cameras, strict=True)
         ),
     )
 

@@ -162,16 +162,14 @@ def is_exact(evidence: Evidence) -> bool:
     return not (len(evidence.shape.modes) or evidence.shape.spread.any())
 
 
-def log_focal_range(
-    camera: Camera, prior: PriorOption, unit: float = 1.0
-) -> tuple[float, float, float, float]:
-    """Bounds of the log focal length [log of ``unit`` px], and its prior's mean and weight."""
+def log_focal_range(camera: Camera, prior: PriorOption) -> tuple[float, float, float, float]:
+    """Bounds of the log focal length relative to the camera's, and its prior's mean and weight."""
     prior = prior_of_camera(prior, camera)
-    side = max(camera.width, camera.height) / unit
+    side = max(camera.width, camera.height) / camera.fx
     low, high = math.log(SHORTEST * side), math.log(LONGEST * side)
     if prior is None:
         return low, high, 0.0, 0.0
-    mean = math.log(prior.focal / unit)
+    mean = math.log(prior.focal / camera.fx)
     return min(low, mean), max(high, mean), mean, prior.relative_sigma**-2
 
 
@@ -230,7 +228,7 @@ class Lenses:
 
     def focals(self) -> Focals:
         """Bounds and priors in the form of the kernels."""
-        ranges = [log_focal_range(camera, self.prior, camera.fx) for camera in self._firsts]
+        ranges = [log_focal_range(camera, self.prior) for camera in self._firsts]
         columns = np.ascontiguousarray(np.array(ranges).reshape(-1, 4).T)
         return Focals(np.array(self.groups, dtype=np.int64), *columns)
 

@@ -182,12 +182,8 @@ def _facing_view(view: View) -> View:
     """Turn the camera of a wide lens to the object; ``up`` and depths stay in the lens's frame."""
     if not needs_facing([view.camera]):
         return view
-    return replace(view, camera=face_pixels(view.camera, _pixels_of_object(view)))
-
-
-def _pixels_of_object(view: View) -> FloatArray:
-    """Pixels (n, 2) of the object: keypoints or, without these, a sample of the mask."""
-    if not view.has_mask_alone:
-        return view.pixels
-    inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
-    return inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)
+    pixels = view.pixels
+    if view.has_mask_alone:
+        inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
+        pixels = inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)
+    return replace(view, camera=face_pixels(view.camera, pixels))

@@ -318,20 +318,14 @@ def points_covariances(
     points: FloatArray, alignment: Alignment, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
-    covariance = covariance[:9, :9]
-    by_logs = (points * alignment.scale)[:, :, None] * np.eye(3)
+    covariance, stretched = covariance[:9, :9], points * alignment.scale
+    by_logs = stretched[:, :, None] * np.eye(3)
     of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
-    rows = point_slopes(points, alignment)
-    return of_points, rows @ covariance @ rows.swapaxes(1, 2)
-
-
-def point_slopes(points: FloatArray, alignment: Alignment) -> FloatArray:
-    """Derivatives (m, 3, 9) of points in the camera's frame by a covariance's unknowns."""
-    stretched = points * alignment.scale
-    by_logs = alignment.rotation * stretched[:, None]
-    shifts = np.broadcast_to(np.eye(3), by_logs.shape)
+    seen_by_logs = alignment.rotation * stretched[:, None]
+    shifts = np.broadcast_to(np.eye(3), seen_by_logs.shape)
     by_turns = by_rotation(stretched @ alignment.rotation.T)
-    return np.concatenate([by_turns, shifts, by_logs], axis=2)
+    rows = np.concatenate([by_turns, shifts, seen_by_logs], axis=2)
+    return of_points, rows @ covariance @ rows.swapaxes(1, 2)
 
 
 @dataclass(frozen=True, eq=False)

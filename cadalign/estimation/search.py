@@ -85,8 +85,11 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
-        whole = _initial_minimum(problem.evidence(shape, lenses), number, lenses)
-        if any(init) and _needs_outlines(problem, whole.evidence):
+        evidence, no_state = problem.evidence(shape, lenses), cast(State, None)
+        every = np.ones(len(evidence.sightings.point), dtype=bool)
+        whole = Minimum(number, every, evidence, no_state, 0.0, np.inf, lenses)
+        if any(init) and problem.uses_outlines and redundancy_of(evidence) < 0:
+            # Only outlines determine all unknowns: a search without them would drift.
             found, used = _score_starts(whole, starts), 0
         else:
             found, used = _find_minima(problem, whole, starts)
@@ -98,17 +101,6 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         _check_support(problem, best, problem.threshold(problem.ransac))
     minima.sort(key=lambda minimum: minimum.score)
     return SearchResult(problem, minima, iterations, hypotheses)
-
-
-def _initial_minimum(evidence: Evidence, component: int, lenses: Lenses) -> Minimum:
-    """A minimum from all sightings, without a state yet."""
-    every, no_state = np.ones(len(evidence.sightings.point), dtype=bool), cast(State, None)
-    return Minimum(component, every, evidence, no_state, 0.0, np.inf, lenses)
-
-
-def _needs_outlines(problem: Problem, evidence: Evidence) -> bool:
-    """True if only outlines determine all unknowns: a search without them would drift."""
-    return problem.uses_outlines and redundancy_of(evidence) < 0
 
 
 def _score_starts(whole: Minimum, starts: Starts) -> list[Minimum]:
@@ -256,7 +248,11 @@ def widen_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Mini
     unknowns = 6 * len(minima[0].state.poses) + int(minima[0].evidence.scales.free.sum())
     redundancy = max(2 * int(unknown.sum()) - unknowns, 1)
     factor = 1 / math.sqrt(widening_of(unknowns, redundancy))
-    return [_scale_noise(each, _unknown_noise(problem.views, each), factor) for each in minima]
+    widened = []
+    for each in minima:
+        evidence = scale_whitening(factor, _unknown_noise(problem.views, each), each.evidence)
+        widened.append(each._replace(evidence=evidence))
+    return widened
 
 
 def _estimate_noise(problem: Problem, minimum: Minimum) -> float:
@@ -265,8 +261,8 @@ def _estimate_noise(problem: Problem, minimum: Minimum) -> float:
     count = int(unknown.sum())
 
     def score(noise: float) -> float:
-        scaled = _scale_noise(minimum, unknown, problem.noise / noise)
-        _, least, _ = refine_joint(scaled.evidence, _NOISE_ITERATIONS, scaled.state)
+        scaled = scale_whitening(problem.noise / noise, unknown, minimum.evidence)
+        _, least, _ = refine_joint(scaled, _NOISE_ITERATIONS, minimum.state)
         prior = (math.log(noise / _USUAL) / _USUAL_LOG_SIGMA) ** 2
         return least + 4 * count * math.log(noise) + prior
 
@@ -288,10 +284,6 @@ def _unknown_noise(views: Sequence[View], minimum: Minimum) -> BoolArray:
     lacking = np.array([view.sigma is None for view in views])
     sightings = minimum.evidence.sightings
     return np.asarray(lacking[sightings.image] & (sightings.whitening[:, 2] > 0))
-
-
-def _scale_noise(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
-    return minimum._replace(evidence=scale_whitening(factor, chosen, minimum.evidence))
 
 
 def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:

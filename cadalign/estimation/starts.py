@@ -16,11 +16,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.estimation.prior import has_scale_prior, redundancy_of
 from cadalign.geometry.rotations import spread_rotations
 from cadalign.solvers.constants import LEAST_POINTS
-from cadalign.solvers.joint.evidence import Evidence, depths_along_axes, distances_of
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    depths_along_axes,
+    distances_of,
+    kept_rows,
+)
 from cadalign.solvers.joint.search import view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
@@ -68,7 +73,9 @@ def _propose(evidence: Evidence, init: Start | None) -> list[_Start]:
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[_Start]] = [[] for _ in range(poses)]
-    counts, unknowns = _keypoint_counts(evidence), 6 + int(evidence.scales.free.sum())
+    is_keypoint = evidence.sightings.whitening[:, 2] > 0
+    counts = np.bincount(evidence.sightings.image[is_keypoint], minlength=len(rig.pose))
+    unknowns = 6 + int(evidence.scales.free.sum())
     is_several = poses > 1 and unknowns > 6
     still = evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3)))
     held = evidence._replace(scales=still)
@@ -114,25 +121,16 @@ def _propose(evidence: Evidence, init: Start | None) -> list[_Start]:
 
 def _match_size(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _Start:
     """Scale a start about the cameras to match measured depths and distances."""
-    factor = _size_factor(evidence, poses, np.exp(log_scales))
+    stretched = evidence.shape.mean * np.exp(log_scales)
+    some = kept_rows(evidence.sightings, evidence.sightings.depths[:, 1] > 0)
+    depths = depths_along_axes(evidence, poses, stretched[some.point], some.image)
+    lengths = distances_of(evidence, poses, stretched)
+    ratios = np.concatenate([some.depths[:, 0] / depths, evidence.offsets.value / lengths])
+    factor = np.median(ratios) if len(ratios) else np.nan
     if not np.isfinite(factor) or not factor > 0:
         return poses, log_scales
     larger = np.concatenate([poses[:, :9], factor * poses[:, 9:]], axis=1)
     return larger, log_scales + np.log(factor)
-
-
-def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
-    """Median ratio of measured to predicted lengths; NaN without measurements."""
-    sightings, mean = evidence.sightings, evidence.shape.mean
-    has_depth, offsets = sightings.depths[:, 1] > 0, evidence.offsets
-    points, image = mean[sightings.point[has_depth]] * scale, sightings.image[has_depth]
-    depths = depths_along_axes(evidence, poses, points, image)
-    ratios = [
-        sightings.depths[has_depth, 0] / depths,
-        offsets.value / distances_of(evidence, poses, mean * scale),
-    ]
-    known = np.concatenate(ratios)
-    return float(np.median(known)) if len(known) else float("nan")
 
 
 def rig_pose(pose: FloatArray, camera: FloatArray) -> FloatArray:
@@ -140,12 +138,6 @@ def rig_pose(pose: FloatArray, camera: FloatArray) -> FloatArray:
     rotation, translation = camera[:9].reshape(3, 3), camera[9:]
     turned = rotation.T @ pose[:9].reshape(3, 3)
     return np.concatenate([turned.ravel(), rotation.T @ (pose[9:] - translation)])
-
-
-def _keypoint_counts(evidence: Evidence) -> IntArray:
-    sightings = evidence.sightings
-    is_keypoint = sightings.whitening[:, 2] > 0
-    return np.bincount(sightings.image[is_keypoint], minlength=len(evidence.rig.pose))
 
 
 def _half_turns(evidence: Evidence, view: int, poses: FloatArray) -> list[FloatArray]:

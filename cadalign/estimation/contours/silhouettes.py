@@ -79,7 +79,10 @@ class Atlas(NamedTuple):
 
 
 def starts_of_mask(problem: Problem) -> list[Inits]:
-    """Starts from a single mask; raises InputError without a prior on the focal length."""
+    """Distinct alignments with silhouettes similar to a single mask, the best first.
+
+    Raises InputError without a prior on the focal length.
+    """
     (view,), camera, model = problem.views, problem.lenses.cameras[0], cast(Model, problem.model)
     known = prior_of_camera(problem.lenses.prior, camera)
     if problem.lenses.count and (known is None or known.relative_sigma > _LARGEST_FOCAL_SIGMA):
@@ -89,38 +92,14 @@ def starts_of_mask(problem: Problem) -> list[Inits]:
             fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
             f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
         )
-    poses = similar_poses(
-        cast(Mesh, model.mesh),
-        cast(FloatArray, view.mask_image),
-        camera,
-        free=np.asarray(problem.prior.scales.free > 0),
-        count=_MOST_SIMILAR,
-        symmetry=model.symmetry,
-    )
-    return [[rotate_alignment(pose, problem.turns[0])] for pose, _ in poses]
-
-
-def similar_poses(
-    mesh: Mesh,
-    mask: FloatArray | BoolArray,
-    camera: Camera,
-    *,
-    free: BoolArray,
-    count: int,
-    symmetry: Symmetry | None = None,
-) -> list[tuple[Alignment, float]]:
-    """Distinct alignments with silhouettes similar to a mask (h, w), the best first.
-
-    Each has its overlap (intersection over union); ``free`` (3,) marks the unknown scales.
-    """
-    view = CentredMask.from_mask(mask, camera)
-    atlas = atlas_of(mesh, _eye_of(mesh, view.outline))
-    poses = _poses_of(*_affine_cameras(atlas, view.outline), atlas, free)
-    found = [(pose, view.overlap(atlas.caster, pose)) for pose in poses]
-    found.sort(key=lambda each: -each[1])
-    kept = select_distinct(found, count, symmetry)
-    turn = view.camera_from_facing
-    return [(rotate_alignment(pose, turn), overlap) for pose, overlap in kept]
+    mask = CentredMask.from_mask(cast(FloatArray, view.mask_image), camera)
+    mesh, free = cast(Mesh, model.mesh), np.asarray(problem.prior.scales.free > 0)
+    atlas = atlas_of(mesh, _eye_of(mesh, mask.outline))
+    poses = _poses_of(*_affine_cameras(atlas, mask.outline), atlas, free)
+    poses.sort(key=lambda pose: -mask.overlap(atlas.caster, pose))
+    kept = select_distinct(poses, _MOST_SIMILAR, model.symmetry)
+    in_camera = [rotate_alignment(pose, mask.camera_from_facing) for pose in kept]
+    return [[rotate_alignment(pose, problem.turns[0])] for pose in in_camera]
 
 
 @lru_cache(maxsize=32)
@@ -300,15 +279,15 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
 
 
 def select_distinct(
-    found: list[tuple[Alignment, float]], count: int, symmetry: Symmetry | None
-) -> list[tuple[Alignment, float]]:
+    found: list[Alignment], count: int, symmetry: Symmetry | None
+) -> list[Alignment]:
     """The first ``count`` alignments that differ, up to symmetry."""
     poses: list[Alignment] = []
-    kept = []
+    kept: list[Alignment] = []
     for each in found:
-        pose = each[0]
+        pose = each
         if symmetry is not None:
-            pose = symmetry.canonical(pose, tolerance=_DISTINCT_STRETCH).alignment
+            pose = symmetry.canonical(each, tolerance=_DISTINCT_STRETCH).alignment
         if all(_differ(pose, other) for other in poses):
             poses.append(pose)
             kept.append(each)

@@ -55,8 +55,7 @@ def test_of_equal_poses_one_is_a_start() -> None:
     about = Symmetry.around([0, 1, 0], fold=None)
     turns = [posed(0).rotation @ rotation_from_vector([0, angle, 0]) for angle in (0, 0.7, 1.5)]
     other = rotation_from_vector([0.6, 0, 0]) @ posed(0).rotation
-    poses = [Alignment(turn, [0, 0, 3], np.ones(3)) for turn in (*turns, other)]
-    found = [(pose, 0.5) for pose in poses]
+    found = [Alignment(turn, [0, 0, 3], np.ones(3)) for turn in (*turns, other)]
     assert select_distinct(found, 4, None) == found
     assert select_distinct(found, 4, about) == [found[0], found[3]]
     assert select_distinct(found, 2, None) == found[:2]

@@ -23,7 +23,7 @@ from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.metrics import box_iou
-from cadalign.report.headline import headline_of
+from cadalign.report.page import headline_of
 
 SYNSET = "03001627"
 BASE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

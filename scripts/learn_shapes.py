@@ -61,16 +61,12 @@ def learn(
     )
 
 
-def main(
-    root: Annotated[Path, tyro.conf.Positional],
-    out: Path = SHAPES,
-    split: str | None = None,
-) -> None:
+def main(root: Annotated[Path, tyro.conf.Positional], out: Path = SHAPES) -> None:
     """Learn and write all shapes."""
     dataset, tables = KeypointNet(root), tomllib.loads(NAMES.read_text(encoding="utf-8"))
     for category in CATEGORIES:
-        models = dataset.subset(categories=[category], split=split)[category]
-        model = learn(examples_of(models, meshes=False), category, tables[category])
+        examples = examples_of(dataset[category], meshes=False)
+        model = learn(examples, category, tables[category])
         path = out / f"{category}.shape"
         model.save(path)
         print(f"{model}: {path.stat().st_size / 1000:.0f} kB")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,21 +15,21 @@ from scipy.spatial.transform import Rotation
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, RansacOptions
-from cadalign.datasets import Colmap, Correspondences, KeypointNet
+from cadalign.datasets import Colmap, Correspondences
 from cadalign.evaluation.experiments.correspondences import errors_of, make_problem
 from cadalign.evaluation.methods import MethodInput
 
+_COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
 _POINTS = 8
 _CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 _SIZES = (25_000, 100_000)  # observations of the shorter and of the longer run
-_VIEWS = (4, 16)  # of each model in the shorter and in the longer evaluation
 _SEARCH = {"max_reproj_error": 4.0, "success_prob": 0.9999}
 
 
 def runs(given: BenchmarkData) -> Tables:
-    """Fits of many observations, evaluations on annotations, and RANSAC.
+    """Fits of many observations, and RANSAC.
 
     Throughput is the difference of a longer and a shorter run with two processes, without start-up
     and figures. The memory's ratio is longer over shorter run.
@@ -40,14 +41,8 @@ def runs(given: BenchmarkData) -> Tables:
             fits = [["fit", str(file), "--no-picture", f"--method={method}"] for file in files]
             rows += _rate_and_memory(f"fits by {method}", _SIZES[1] - _SIZES[0], *fits)
             if method == "aepnp":
-                rows.append(_dask_over_processes("fits", fits[0]))
+                rows.append(_dask_over_processes(fits[0]))
     yield f"Fits of {_POINTS} keypoints", rows
-    root = given.folder("keypointnet")
-    call = ["evaluate", "keypointnet", str(root), "--visibility=hull", "--json"]
-    pair = [[*call, "--methods=aepnp", f"--views-per-model={each}"] for each in _VIEWS]
-    count = (_VIEWS[1] - _VIEWS[0]) * len(KeypointNet(root))
-    rows = list(_rate_and_memory("evaluation on annotations", count, *pair))
-    yield "Evaluations", [*rows, _dask_over_processes("evaluation", [*call, "--views-per-model=3"])]
     yield "RANSAC on real correspondences", _ransac(given)
 
 
@@ -57,18 +52,18 @@ def _rate_and_memory(name: str, count: int, shorter: list[str], longer: list[str
     yield section.figure(f"{name}, memory", more, "MB", more / less, "the shorter run")
 
 
-def _dask_over_processes(name: str, call: list[str]) -> Row:
+def _dask_over_processes(call: list[str]) -> Row:
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         dask, _ = _measure(*call, f"--dask={cluster.scheduler_address}")
     processes, _ = _measure(*call, "--workers=2")
-    return section.figure(f"{name}, two Dask workers", dask, "s", dask / processes, "two processes")
+    return section.figure("fits, two Dask workers", dask, "s", dask / processes, "two processes")
 
 
 def _measure(*call: str) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
-        return section.measure_command([*COMMAND, *call, f"--out={folder}/run"])
+        return section.measure_command([*_COMMAND, *call, f"--out={folder}/run"])
 
 
 def _write_observations(folder: Path, count: int, seed: int) -> Path:

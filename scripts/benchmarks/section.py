@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,8 +24,6 @@ from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenObject, observe_object, unseen_tasks
 from cadalign.geometry.rotations import vector_from_rotation
 
-COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
-"""The command `cadalign` of this Python."""
 _DATA = Path(os.environ["CADALIGN_DATA"]) if os.environ.get("CADALIGN_DATA") else None
 
 Row = dict[str, Any]
@@ -46,8 +43,6 @@ class BenchmarkData:
     """Seed of the random number generators."""
     count: int | None = None
     """Number of problems, objects, queries or calls per row; the default depends on the section."""
-    split: str = "val"
-    """Split of the objects of the section shapes."""
     sizes: tuple[int, ...] = (50_000,)
     """Numbers of models in the synthetic libraries of the section retrieval."""
     sections: tyro.conf.Positional[tuple[str, ...]] = ()

@@ -29,7 +29,7 @@ _TIMED = ("chair", "airplane", "mug")
 def shapes(given: BenchmarkData) -> Tables:
     """Accuracy on objects without their own model, and times of `align`.
 
-    Objects are from the split ``given.split``; shape models are learned from the split train. Times
+    Objects are from the split val; shape models are learned from the split train. Times
     of single views are processor times after warm-up, on one thread, with up to 14 keypoints. The
     batch holds every object five times and uses two threads.
     """
@@ -43,7 +43,7 @@ def _accuracy(given: BenchmarkData, root: Path) -> Iterator[Row]:
     for category in KeypointNet(root).categories:
         row: Row = {"category": category}
         for name, (noise, is_half) in _SETTINGS.items():
-            how = {"noise_px": noise, "split": given.split, "seed": given.seed}
+            how = {"noise_px": noise, "seed": given.seed}
             seen = section.unseen_objects(root, category, given.count or 100, **how)
             cases = [({}, halved(each) if is_half else each) for _, each in seen]
             errors = partial(_errors, shape=section.learned_shape(root, category))
@@ -87,7 +87,7 @@ def _values(rows: list[Row], name: str) -> FloatArray:
 def _times(given: BenchmarkData, root: Path) -> Iterator[Row]:
     for category in _TIMED:
         shape = section.learned_shape(root, category)
-        how = {"keypoints": 14, "noise_px": 2.0, "split": given.split}
+        how = {"keypoints": 14, "noise_px": 2.0}
         found = section.unseen_objects(root, category, given.count or 40, **how)
         views = [seen.view_of(shape) for _, seen in found]
         for view in views[:2]:  # compile

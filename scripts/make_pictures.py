@@ -18,7 +18,7 @@ import tyro
 from cadalign import Alignment, Box, Library, Observation, ShapeModel, View, align, fit
 from cadalign.cli.example import CAMERA, GROUND, VIEW, write_example
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
-from cadalign.evaluation.instances.instance import load_scene, make_instance
+from cadalign.evaluation.instances.instance import make_instance, scene_of
 from cadalign.io.images import read_image, write_image
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.pretrained import CATEGORIES
@@ -51,7 +51,7 @@ def overview() -> None:
 def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
     model = dataset[category, f"sample_{category}_{number}"]
     instance = make_instance(
-        model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
+        model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=scene_of(model)
     )
     result = fit(instance.points_3d, instance.points_2d, instance.camera)
     frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)

@@ -138,9 +138,9 @@ class Benchmark:
         return self.setting.record_columns
 
     def plan(
-        self, options: ExperimentOptions, tasks: Sequence[T], *, chunk: int, **more: Any
+        self, options: ExperimentOptions, tasks: Sequence[T], *, chunk: int = 8, **more: Any
     ) -> Plan[T]:
-        """Plan a run; ``more`` adds to the options in its configuration."""
+        """Plan a run by chunks of tasks; ``more`` adds to the options in its configuration."""
         return Plan(self, tasks, options.as_config() | more, chunk)
 
     def evaluate(self, tasks: Sequence[Any]) -> list[Row]:

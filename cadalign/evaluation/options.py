@@ -71,13 +71,6 @@ class ExperimentOptions:
             if value not in known:
                 raise unknown_name("value", value, known, where=name)
 
-    def check_noise(self, *names: str) -> None:
-        """Raise InputError for standard deviations that are negative or not finite."""
-        for name in names:
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise InputError(f"{value} is not a noise level", where=name)
-
     def replace_values(self, **values: Any) -> None:
         """Replace options of a new, still unshared instance."""
         for name, value in values.items():
@@ -147,7 +140,7 @@ class FunctionOptions(ExperimentOptions):
 
 @dataclass(frozen=True)
 class ModelOptions(ExperimentOptions):
-    """Selection of a dataset's models."""
+    """Selection of a dataset's models, and the noise of their keypoints."""
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder of a data set in KeypointNet's layout."""
@@ -158,10 +151,14 @@ class ModelOptions(ExperimentOptions):
     """Maximum number of models per category; all by default."""
     shapenet: Path | None = None
     """Folder of ShapeNetCore, if the meshes are not inside the dataset's folder."""
+    noise_px: float = 1.0
+    """Standard deviation of the keypoint noise [px]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_least(max_models=1)
+        if not 0 <= self.noise_px < math.inf:
+            raise InputError(f"{self.noise_px} is not a noise level", where="noise_px")
 
 
 @dataclass(frozen=True)
@@ -169,14 +166,11 @@ class ViewOptions(ModelOptions, FunctionOptions):
     """Views of a dataset's models, with noisy keypoints."""
 
     _: KW_ONLY
-    noise_px: float = 1.0
-    """Standard deviation of the keypoint noise [px]."""
     views_per_model: int = 1
     """Number of views per model; each view is one instance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_noise("noise_px")
         self.check_least(views_per_model=1)
 
     @property

@@ -97,22 +97,16 @@ class Plot:
         }
 
 
-def plot_against(
-    found: Sequence[Sequence[Summary]], x: Metric, y: Metric, *, place: str, **words: str
-) -> Plot:
-    """Plot ``y`` against ``x``, which is the column ``place`` of summaries, by run and method.
-
-    ``words`` are further fields of the plot.
-    """
+def plot_against(found: Sequence[Sequence[Summary]], x: Metric, y: Metric, *, note: str) -> Plot:
+    """Plot ``y`` against ``x``, two columns of summaries, by run and method."""
     traces = []
     for index, summaries in enumerate(found):
         for method in dict.fromkeys(each.method for each in summaries):
             rows = [each for each in summaries if each.method == method]
-            places = [x.factor * each[place] for each in rows]
-            traces.append(
-                Trace.from_values(index, method, places, [each[y.key] for each in rows], y)
-            )
-    return Plot(**{"id": y.key, **words}, x=x, y=y, traces=traces)
+            places = [x.factor * each[x.key] for each in rows]
+            values = [each[y.key] for each in rows]
+            traces.append(Trace.from_values(index, method, places, values, y))
+    return Plot(y.key, x, y, traces, note)
 
 
 def compact(values: npt.ArrayLike | Sequence[float | None]) -> list[float | None]:

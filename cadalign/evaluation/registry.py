@@ -128,13 +128,13 @@ class Spec:
 
 # In the order of help texts and messages.
 _EXPERIMENTS = {
-    "keypointnet": "cadalign.evaluation.experiments.keypointnet:SPEC",
-    "demo": "cadalign.evaluation.experiments.demo:SPEC",
-    "simulate": "cadalign.evaluation.experiments.simulation:SPEC",
-    "correspondences": "cadalign.evaluation.experiments.correspondences:SPEC",
-    "retrieval": "cadalign.evaluation.experiments.retrieval:SPEC",
-    "unseen": "cadalign.evaluation.experiments.unseen:SPEC",
-    "photos": "cadalign.evaluation.experiments.photos:SPEC",
+    "keypointnet": "cadalign.evaluation.experiments.keypointnet",
+    "demo": "cadalign.evaluation.experiments.demo",
+    "simulate": "cadalign.evaluation.experiments.simulation",
+    "correspondences": "cadalign.evaluation.experiments.correspondences",
+    "retrieval": "cadalign.evaluation.experiments.retrieval",
+    "unseen": "cadalign.evaluation.experiments.unseen",
+    "photos": "cadalign.evaluation.experiments.photos",
 }
 BATCHES: dict[str, str] = {}
 """Specifications of batch runs over observations, which `cadalign.report` also shows."""
@@ -147,11 +147,10 @@ def known_options() -> Iterator[type[ExperimentOptions]]:
 
 def spec_named(name: str) -> Spec:
     """The specification of an experiment."""
-    place = (_EXPERIMENTS | BATCHES).get(name)
-    if place is None:
+    module = (_EXPERIMENTS | BATCHES).get(name)
+    if module is None:
         raise unknown_name("experiment", name, list(_EXPERIMENTS))
-    module, _, attribute = place.partition(":")
-    spec: Spec = getattr(import_module(module), attribute or "SPEC")
+    spec: Spec = import_module(module).SPEC
     return spec
 
 

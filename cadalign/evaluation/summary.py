@@ -142,7 +142,12 @@ def medians(*columns: Metric) -> Statistics:
 
 def median(key: str, factor: float = 1.0) -> Callable[[Group], float]:
     """The median of a column, times a factor; NaN if the run lacks the column."""
-    return lambda group: median_of(factor * group.solved.get(key, np.empty(0)).astype(float))
+
+    def made(group: Group) -> float:
+        values = factor * drop_nan(group.solved.get(key, np.empty(0)))
+        return float(np.median(values)) if len(values) else np.nan
+
+    return made
 
 
 def mean(key: str) -> Callable[[Group], float]:
@@ -178,12 +183,6 @@ def drop_nan(values: npt.NDArray[Any]) -> FloatArray:
     """The values (n,) that are not missing."""
     numbers = values.astype(float)
     return np.asarray(numbers[~np.isnan(numbers)])
-
-
-def median_of(values: npt.NDArray[Any]) -> float:
-    """Median of the values (n,) that are not missing; NaN if all are."""
-    found = drop_nan(values)
-    return float(np.median(found)) if len(found) else np.nan
 
 
 def mean_of(values: npt.NDArray[Any]) -> float:

@@ -22,7 +22,7 @@ from cadalign.evaluation.experiments.keypointnet import (
     keypointnet_benchmark,
     summarize_views,
 )
-from cadalign.evaluation.instances.instance import load_scene, make_instance
+from cadalign.evaluation.instances.instance import make_instance, scene_of
 from cadalign.evaluation.instances.pictures import draw_instance
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
@@ -152,7 +152,7 @@ def test_pictures_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
 def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Path) -> None:
     """With much noise, the Cramer-Rao bound has such estimates."""
     model = next(iter(KeypointNet(sample_root)))
-    scene = load_scene(model)
+    scene = scene_of(model)
     instance = make_instance(model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=scene)
     behind = Alignment(instance.gt.rotation, -instance.gt.translation, instance.gt.scale)
     folder = RunFolder(tmp_path / "run").made_for_pictures()

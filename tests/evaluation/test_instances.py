@@ -51,7 +51,7 @@ def test_keypoints_without_a_hull_are_all_visible(points: FloatArray) -> None:
 def test_views_fill_the_image_and_stay_inside(seed: int) -> None:
     hull = KeypointHull(cloud(seed))
     rng = np.random.default_rng(seed)
-    pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=6)
+    pose, visible = sample_hull_view(hull, rng=rng, min_visible=6)
     corners = Box.from_model(hull.bounds, pose).corners
     offset = np.abs(KEYPOINT_CAMERA.project(corners) - [319.5, 239.5])
     share = (2 * offset / [640, 480]).max()
@@ -66,9 +66,9 @@ def test_views_fill_the_image_and_stay_inside(seed: int) -> None:
 def test_too_few_keypoints_are_an_error_that_says_how_many() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(DegenerateError, match="there are only 5"):
-        sample_hull_view(KeypointHull(cloud(count=5)), KEYPOINT_CAMERA, rng=rng, min_visible=6)
+        sample_hull_view(KeypointHull(cloud(count=5)), rng=rng, min_visible=6)
     with pytest.raises(DegenerateError, match="the best of 100 views shows"):
-        sample_hull_view(KeypointHull(CUBE), KEYPOINT_CAMERA, rng=rng, min_visible=8)
+        sample_hull_view(KeypointHull(CUBE), rng=rng, min_visible=8)
 
 
 def test_views_drawn_together_equal_views_drawn_alone() -> None:
@@ -78,9 +78,9 @@ def test_views_drawn_together_equal_views_drawn_alone() -> None:
     def streams() -> list[np.random.Generator]:
         return [np.random.default_rng(seed) for seed in range(len(hulls))]
 
-    together = sample_hull_views(hulls, KEYPOINT_CAMERA, rngs=streams(), min_visible=8)
+    together = sample_hull_views(hulls, rngs=streams(), min_visible=8)
     for hull, rng, found in zip(hulls, streams(), together, strict=True):
-        (alone,) = sample_hull_views([hull], KEYPOINT_CAMERA, rngs=[rng], min_visible=8)
+        (alone,) = sample_hull_views([hull], rngs=[rng], min_visible=8)
         if isinstance(found, TooFewVisibleError):
             assert str(found) == str(alone)
             continue

@@ -28,7 +28,7 @@ from cadalign.datasets import (
 )
 from cadalign.io.images import photo_size, read_photo
 from cadalign.io.observation import Observation
-from cadalign.report.headline import headline_of
+from cadalign.report.page import headline_of
 from cadalign.report.runs import read_runs
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.models import SEAL

@@ -26,7 +26,7 @@ from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.datasets.model_keypoints import ModelKeypoint
-from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
+from cadalign.evaluation.instances.instance import Instance, make_instance, scene_of
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer
 
@@ -89,7 +89,7 @@ def make_case(
     """Render the photo of a model and write camera and keypoints."""
     model = KeypointNet(root)[category, model_id]
     instance = make_instance(
-        model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
+        model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=scene_of(model)
     )
     frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)
     case = Case(

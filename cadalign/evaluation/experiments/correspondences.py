@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import lru_cache, partial
+from itertools import product, starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 import tyro
 
 from cadalign.arrays import FloatArray, instance_rng
-from cadalign.datasets import Correspondences, CorrespondenceSet, open_correspondences
+from cadalign.datasets import Correspondences, open_correspondences
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import RansacOptions
 from cadalign.evaluation import metrics
@@ -128,28 +129,6 @@ class CorrespondenceTask(NamedTuple):
 
 _images_of = lru_cache(maxsize=1)(open_correspondences)
 """The images of a folder, read once per process."""
-
-
-def correspondence_tasks(
-    images: CorrespondenceSet, options: CorrespondenceOptions
-) -> list[CorrespondenceTask]:
-    """All draws of all images and shares; raises DataError if there are no images."""
-    names = images.names
-    if not names:
-        raise DataError("there are no images", where=str(images.root))
-    draws = range(options.draws)
-    return [
-        CorrespondenceTask(name, share, draw)
-        for name in names
-        for share in options.outliers
-        for draw in draws
-    ]
-
-
-def _fingerprint(root: Path) -> str:
-    """Hash of the files, so that a run cannot continue with other data."""
-    folder = root if root.is_dir() else root.parent
-    return fingerprint_of_files(sorted(path for path in folder.iterdir() if path.is_file()))
 
 
 _SUCCESS_DEG, _SUCCESS_SCALE = 0.5, 0.01  # upper bounds of rotation and relative scale errors
@@ -270,24 +249,29 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
         metrics.QUERY_MILLISECONDS: "medians",
     }
     return [
-        plot_against(found, metrics.OUTLIERS, metric, place="outliers", note=note)
-        for metric, note in notes.items()
+        plot_against(found, metrics.OUTLIERS, metric, note=note) for metric, note in notes.items()
     ]
 
 
-_CHUNK = 8
-
-
 def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[CorrespondenceTask]:
-    """Plan a run over the images of a model or data set."""
+    """Plan a run over all draws of all images of a model or data set."""
     _images_of.cache_clear()  # the files may have changed in this session
     images = _images_of(options.path)
-    tasks = correspondence_tasks(images, options)
-    more = {"loader": type(images).__name__, "correspondences": _fingerprint(Path(images.root))}
+    if not images.names:
+        raise DataError("there are no images", where=str(images.root))
+    every = product(images.names, options.outliers, range(options.draws))
+    tasks = list(starmap(CorrespondenceTask, every))
+    root = Path(images.root)
+    files = sorted(filter(Path.is_file, (root if root.is_dir() else root.parent).iterdir()))
     benchmark = Benchmark.from_methods(
         ImageProblems(options), options.methods, metrics=options.metrics
     )
-    return benchmark.plan(options, tasks, chunk=_CHUNK, **more)
+    return benchmark.plan(
+        options,
+        tasks,
+        loader=type(images).__name__,
+        correspondences=fingerprint_of_files(files),
+    )
 
 
 SPEC = Spec(

@@ -27,7 +27,6 @@ from cadalign.evaluation.metrics.photos import (
     measure_box,
     measure_scan2cad,
     measure_viewpoint,
-    statistics_of,
 )
 from cadalign.evaluation.options import FunctionOptions, is_function
 from cadalign.evaluation.plots import cumulative_curves
@@ -35,8 +34,10 @@ from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import LEFT_OUT, Columns, Plan
 from cadalign.evaluation.summary import (
     Summary,
+    drop_nan,
     mean,
     median,
+    medians,
     milliseconds,
     summarize,
 )
@@ -145,10 +146,11 @@ _CONSOLE = (
 
 def summarize_objects(run: Run) -> list[Summary]:
     """One summary per category and method, and per method over all categories."""
-    cells = run.cells
+    known = [rate for rate in RATES if len(drop_nan(run.cells[rate.column.key]))]
     statistics = {
         "keypoints": mean("keypoints"),
-        **statistics_of(cells),
+        **medians(*MEDIANS),
+        **{rate.metric.key: rate.share for rate in known},
         metrics.RMS.key: median(metrics.RMS.key),
         "milliseconds": milliseconds,
     }
@@ -161,21 +163,18 @@ _CURVES = (
 )
 
 
-_CHUNK = 8
-
-
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.instances.photos import photos_benchmark
-    from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, reload_photos
+    from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, photos_of
 
-    dataset = reload_photos(options.root)
+    photos_of.cache_clear()  # the files may have changed in this session
+    dataset = photos_of(options.root)
     tasks = photo_tasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     return photos_benchmark(options, pictures).plan(
         options,
         tasks,
-        chunk=_CHUNK,
         kind=dataset.kind,
         annotations=annotations_of(dataset, tasks),
     )

@@ -79,14 +79,11 @@ class RetrievalRunOptions(ModelOptions):
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout, or the file of a library."""
     _: KW_ONLY
-    noise_px: float = 1.0
-    """Standard deviation of the keypoint noise [px]."""
     keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
     """Numbers of keypoints per query; each number is evaluated."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_noise("noise_px")
         self.replace_values(keypoints=tuple(sorted(set(self.keypoints))))
         if not self.keypoints:
             raise InputError("none is given", where="keypoints")
@@ -165,7 +162,7 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
     hull = KeypointHull(model.xyz * stretch)
-    pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=task.keypoints)
+    pose, visible = sample_hull_view(hull, rng=rng, min_visible=task.keypoints)
     chosen = np.sort(rng.choice(np.flatnonzero(visible), task.keypoints, replace=False))
     pixels = KEYPOINT_CAMERA.project(pose.apply(hull.xyz[chosen]))
     return RetrievalQuery(
@@ -300,9 +297,6 @@ def summarize_queries(run: Run) -> list[Summary]:
     )
 
 
-_CHUNK = 16
-
-
 def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]:
     """Plan a run over a library's models; the run's folder gets the library."""
     from cadalign.retrieval.library import Library
@@ -318,7 +312,7 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
     if not file.is_file():
         library.save(file)
     benchmark = retrieval_benchmark(str(file.absolute()), options)
-    return benchmark.plan(options, tasks, chunk=_CHUNK, library=name)
+    return benchmark.plan(options, tasks, chunk=16, library=name)
 
 
 SPEC = Spec(

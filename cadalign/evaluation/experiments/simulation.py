@@ -149,9 +149,8 @@ COLUMNS: Columns = (
 
 
 class SweepTask(NamedTuple):
-    """One random problem: its settings and number; ``value`` is of the varied quantity."""
+    """One random problem: its settings and number."""
 
-    value: float
     points: int
     noise_px: float
     outlier_share: float
@@ -160,18 +159,14 @@ class SweepTask(NamedTuple):
     @property
     def names(self) -> Row:
         """The cells that identify its rows, without the method."""
-        return {name: value for name, value in self._asdict().items() if name != "value"}
+        return self._asdict()
 
 
 def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
     """All problems of a sweep, value by value."""
     held = {name: getattr(kind, name) for name in ("points", "noise_px", "outlier_share")}
-    settings = ({**held, kind.column: value, "value": value} for value in kind.values)
-    return [
-        SweepTask(**{**setting, "points": int(setting["points"])}, run=run)
-        for setting in settings
-        for run in range(kind.runs)
-    ]
+    settings = (held | {kind.column: type(held[kind.column])(value)} for value in kind.values)
+    return [SweepTask(**each, run=run) for each in settings for run in range(kind.runs)]
 
 
 @dataclass(frozen=True)
@@ -193,11 +188,9 @@ class SweepProblems(Setting):
 
     def problem(self, task: SweepTask) -> SimulatedProblem:
         """The problem of a task."""
-        rng = instance_rng(self.seed, self.sweep, repr(float(task.value)), str(task.run))
-        noise_px, outlier_share = task.noise_px, task.outlier_share
-        return simulate_problem(
-            rng, points=task.points, noise_px=noise_px, outlier_share=outlier_share
-        )
+        settings, column = task._asdict(), SWEEPS[self.sweep].column
+        names = repr(float(settings[column])), str(settings.pop("run"))
+        return simulate_problem(instance_rng(self.seed, self.sweep, *names), **settings)
 
 
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
@@ -231,19 +224,15 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
     """Plots of errors against the varied quantity."""
     x, found = varied_quantity(runs[0]), [summarize_sweep(run) for run in runs]
     return [
-        plot_against(found, x, metric, place=x.key, note="medians")
-        for metric in (*ERRORS, *runs[0].metrics)
+        plot_against(found, x, metric, note="medians") for metric in (*ERRORS, *runs[0].metrics)
     ]
-
-
-_CHUNK = 64
 
 
 def plan(options: SweepOptions, folder: RunFolder) -> Plan[SweepTask]:
     """Plan a sweep."""
     kind = options.kind
     benchmark = sweep_benchmark(kind, options.seed, options.metrics)
-    return benchmark.plan(options, sweep_tasks(kind), chunk=_CHUNK, **plain_value(kind))
+    return benchmark.plan(options, sweep_tasks(kind), chunk=64, **plain_value(kind))
 
 
 SPEC = Spec(

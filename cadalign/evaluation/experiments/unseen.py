@@ -166,9 +166,6 @@ def learn(
     return place.absolute()
 
 
-_CHUNK = 8
-
-
 def plan(options: UnseenOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over a split's objects; the run's folder gets the learned shapes."""
     from cadalign.evaluation.instances.unseen import unseen_benchmark, unseen_tasks
@@ -177,9 +174,8 @@ def plan(options: UnseenOptions, folder: RunFolder) -> Plan[KeypointTask]:
     tasks = unseen_tasks(dataset, options)
     categories = sorted({category for category, _ in tasks.keys})
     learned = learn(dataset, categories, split=options.train, folder=folder)
-    hashes = {"annotations": tasks.fingerprint(), "learned": learned.name}
     benchmark = unseen_benchmark(learned, options)
-    return benchmark.plan(options, tasks, chunk=_CHUNK, **hashes)
+    return benchmark.plan(options, tasks, annotations=tasks.fingerprint(), learned=learned.name)
 
 
 SPEC = Spec(

@@ -87,26 +87,19 @@ HullView = tuple[Alignment, BoolArray]
 """A view: the pose, and a mask (k,) of the keypoints that count as visible."""
 
 
-def sample_hull_view(
-    hull: KeypointHull, camera: Camera, *, rng: np.random.Generator, min_visible: int
-) -> HullView:
+def sample_hull_view(hull: KeypointHull, *, rng: np.random.Generator, min_visible: int) -> HullView:
     """Draw a view with enough visible keypoints, from `cadalign.render.sample_view`'s distribution.
 
-    The camera must have no lens distortion. Raises TooFewVisibleError if no view shows enough
-    keypoints.
+    Raises TooFewVisibleError if no view shows enough keypoints.
     """
-    (found,) = sample_hull_views([hull], camera, rngs=[rng], min_visible=min_visible)
+    (found,) = sample_hull_views([hull], rngs=[rng], min_visible=min_visible)
     if isinstance(found, TooFewVisibleError):
         raise found
     return found
 
 
 def sample_hull_views(
-    hulls: Sequence[KeypointHull],
-    camera: Camera,
-    *,
-    rngs: Sequence[np.random.Generator],
-    min_visible: int,
+    hulls: Sequence[KeypointHull], *, rngs: Sequence[np.random.Generator], min_visible: int
 ) -> list[HullView | TooFewVisibleError]:
     """Draw a view of each hull from its own random stream; see `sample_hull_view`."""
     counts = [len(hull.xyz) for hull in hulls]
@@ -116,7 +109,7 @@ def sample_hull_views(
     for _ in range(_ATTEMPTS if left else 0):
         draws = np.array([rngs[k].random(3) for k in left])
         bounds = np.array([hulls[k].bounds for k in left])
-        poses = _framed_poses(_LOWEST + (_HIGHEST - _LOWEST) * draws, bounds, camera)
+        poses = _framed_poses(_LOWEST + (_HIGHEST - _LOWEST) * draws, bounds)
         for k, rotation, translation, position in zip(left, *poses, strict=True):
             visible = hulls[k].visible_from(position)
             best[k] = max(best[k], int(np.count_nonzero(visible)))
@@ -139,7 +132,7 @@ def _too_few(count: int, best: int, min_visible: int) -> TooFewVisibleError:
 
 
 def _framed_poses(
-    drawn: FloatArray, bounds: FloatArray, camera: Camera
+    drawn: FloatArray, bounds: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rotations (n, 3, 3), translations (n, 3) and camera positions (n, 3) of framed views.
 
@@ -149,7 +142,7 @@ def _framed_poses(
     low, high = bounds[:, 0], bounds[:, 1]
     rotations = _upright_rotations(drawn[:, 0], np.arcsin(drawn[:, 1]))
     corners = (high - low)[:, None] * _CORNERS @ rotations.transpose(0, 2, 1)
-    centers = _framed_centers(corners, camera, fill=drawn[:, 2])
+    centers = _framed_centers(corners, fill=drawn[:, 2])
     middles = ((low + high) / 2)[:, :, None]
     translations = centers - (rotations @ middles)[:, :, 0]
     positions = -(rotations.transpose(0, 2, 1) @ translations[:, :, None])[:, :, 0]
@@ -168,13 +161,14 @@ def _upright_rotations(azimuths: FloatArray, elevations: FloatArray) -> FloatArr
     return np.stack(rows, axis=-1).reshape(-1, 3, 3)
 
 
-def _framed_centers(corners: FloatArray, camera: Camera, *, fill: FloatArray) -> FloatArray:
+def _framed_centers(corners: FloatArray, *, fill: FloatArray) -> FloatArray:
     """Positions (n, 3) of boxes' centres in the camera frame, to fill shares (n,) of the image.
 
     ``corners`` (n, 8, 3) are relative to the centres. Let a be the ray through the image's centre.
     With the box's centre at depth d on it, a corner X projects to f |X - a X_z| / (X_z + d) from
     the image's centre. This is solved for d; the largest d of all corners and directions is used.
     """
+    camera = KEYPOINT_CAMERA
     size = np.array([camera.width, camera.height])
     focal = np.array([camera.fx, camera.fy])
     ray = ((size - 1) / 2 - (camera.cx, camera.cy)) / focal
@@ -259,17 +253,14 @@ class Instance:
         return Box.from_model(self.bounds, self.gt)
 
 
-def load_scene(model: AnnotatedModel) -> Scene:
+@lru_cache(maxsize=1)  # views of a model follow each other
+def scene_of(model: AnnotatedModel) -> Scene:
     """Read a model's mesh for `make_instance`."""
     from cadalign.render import Scene
 
     mesh = model.load_mesh()
     check_solid(mesh)
     return Scene(mesh)
-
-
-scene_of = lru_cache(maxsize=1)(load_scene)
-"""`load_scene` with the last scene cached, as views of a model follow each other."""
 
 
 def make_instance(
@@ -284,7 +275,7 @@ def make_instance(
     """Draw a view, a stretch and keypoint noise [px] for an annotated model with a mesh.
 
     The instance depends only on (seed, category, model id, view index). ``scene`` is the model's,
-    from `load_scene`.
+    from `scene_of`.
     """
     from cadalign.render import sample_view
 
@@ -307,7 +298,7 @@ def make_hull_instances(
     """
     rngs = [instance_rng(seed, each.category, each.model_id, str(each.view)) for each in views]
     hulls = [each.hull for each in views]
-    sampled = sample_hull_views(hulls, KEYPOINT_CAMERA, rngs=rngs, min_visible=min_visible)
+    sampled = sample_hull_views(hulls, rngs=rngs, min_visible=min_visible)
     seen = [
         _View(found[0], each.hull.xyz[found[1]], each.ids[found[1]], each.hull.bounds, rng)
         for each, rng, found in zip(views, rngs, sampled, strict=True)

@@ -16,7 +16,6 @@ from cadalign.datasets.photo import (
     NamedPoints,
     Photo,
     PhotoDataset,
-    PhotoKeypoints,
     PhotoObject,
 )
 from cadalign.errors import DataError
@@ -73,12 +72,6 @@ def annotations_of(dataset: PhotoDataset, tasks: Sequence[PhotoTask]) -> str:
 
 photos_of = lru_cache(maxsize=1)(open_photos)
 """The data set of a folder, listed once per process."""
-
-
-def reload_photos(root: Path) -> PhotoDataset:
-    """List a data set again, as its files may have changed in this session."""
-    photos_of.cache_clear()
-    return photos_of(root)
 
 
 @dataclass(frozen=True)
@@ -218,7 +211,8 @@ def make_sighting(target: PhotoTarget, protocol: Protocol) -> Sighting:
     marks = target.found.keypoints
     if marks is None or model is None:
         raise LeftOutError("there are no keypoints")
-    names, pixels = _shared_marks(marks, model)
+    shared = np.isin(marks.names, model.names)
+    names, pixels = tuple(np.array(marks.names)[shared].tolist()), marks.points_2d[shared]
     if len(names) < _LEAST_KEYPOINTS:
         raise LeftOutError(f"{len(names)} keypoints are fewer than {_LEAST_KEYPOINTS}")
     bounds, gt = target.bounds, target.gt
@@ -237,12 +231,6 @@ def make_sighting(target: PhotoTarget, protocol: Protocol) -> Sighting:
         protocol=protocol,
         input=given if camera.focal_known else _estimate_focal(given),
     )
-
-
-def _shared_marks(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
-    """The visible keypoints that the model also has, and their pixels."""
-    good = np.isin(marks.names, model.names)
-    return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 
 def _sigma(target: PhotoTarget, protocol: Protocol) -> float:

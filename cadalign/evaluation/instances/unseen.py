@@ -102,7 +102,7 @@ def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
     xyz = task.hull.xyz
     count = len(xyz)
     rng = instance_rng(options.seed, *names)
-    gt, _ = sample_hull_view(task.hull, KEYPOINT_CAMERA, rng=rng, min_visible=0)
+    gt, _ = sample_hull_view(task.hull, rng=rng, min_visible=0)
     rng = instance_rng(options.seed, *names, "keypoints")
     order, noise = rng.permutation(count), rng.standard_normal((count, 2))
     rows = np.sort(order[: options.keypoints])

@@ -48,10 +48,7 @@ class Metric:
 
     def text(self, value: Any) -> str:
         """Convert a value to the unit and format it; a dash if it is missing or not finite."""
-        return self.format(self.shown(value))
-
-    def format(self, shown: float | None) -> str:
-        """Format a value in the unit; a dash for None."""
+        shown = self.shown(value)
         if shown is None:
             return "-"
         return f"{shown:.3g}" if abs(shown) >= _HUGE else f"{shown:.{self.digits}f}"

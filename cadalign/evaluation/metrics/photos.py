@@ -23,7 +23,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap
 from cadalign.evaluation.runs.work import Row
-from cadalign.evaluation.summary import Group, drop_nan, medians
+from cadalign.evaluation.summary import Group, drop_nan
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
@@ -31,8 +31,6 @@ from cadalign.metrics import box_iou, rotation_error, scale_error
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.sighting import PhotoTarget
-    from cadalign.evaluation.runs.tables import Cells
-    from cadalign.evaluation.summary import Statistics
 
 Measure = Callable[["PhotoTarget", Alignment, Alignment, Box], Row]
 """Function of an object, the estimated and the true alignment of the data set's model, and the
@@ -71,17 +69,6 @@ class Protocol:
         gt = target.gt
         rows = [] if gt is None else [each(target, est, gt, box) for each in self.measures]
         return {name: value for row in rows for name, value in row.items()}
-
-
-def statistics_of(cells: Cells) -> Statistics:
-    """Medians over objects that did not fail, and shares of all objects with a known truth.
-
-    Shares are left out if their column is empty in ``cells``.
-    """
-    shares = {
-        rate.metric.key: rate.share for rate in RATES if len(drop_nan(cells[rate.column.key]))
-    }
-    return {**medians(*MEDIANS), **shares}
 
 
 def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> float:

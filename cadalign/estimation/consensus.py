@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
-from cadalign.estimation.problems import Problems, rays_of, whitening_of
+from cadalign.estimation.problems import Problems, rays_of, sample_weights, whitening_of
 from cadalign.estimation.result_parts import EstimateWarning, FitStats, FittedKeypoints
 from cadalign.estimation.solve import fit_keypoints
 from cadalign.estimation.uncertainty.residuals import (
@@ -33,7 +33,6 @@ from cadalign.solvers.ransac import Settings, ransac_kernel
 _MOST_EXHAUSTIVE = 1000  # subsets, up to which all are tried
 _CHANCE = 0.2  # largest expected number of alignments by chance
 _INLIER_ROUNDS = 5
-_LEAST_CONFIDENCE = 0.01  # relative to the largest, so that every keypoint can be drawn
 _FIRST, _FACTOR = 4.0, 2.0  # first threshold [px], and ratio of the next ones, at unknown noise
 _WIDEST = 0.25  # largest threshold, relative to the keypoints' extent
 
@@ -201,7 +200,7 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
         raise InputError(
             f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
         )
-    confidence = _confidence(search.scores, count)
+    confidence = sample_weights(search.scores, count)
     order = np.random.default_rng(ransac.seed).permutation(count)
     if len(confidence):
         confidence = np.cumsum(confidence[order])
@@ -241,20 +240,3 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
     return Alignment.from_vector(pose), kept, int(iterations), int(hypotheses), float(score)
-
-
-def _confidence(scores: npt.ArrayLike | None, count: int) -> FloatArray:
-    """Probabilities of keypoints (n,) in a sample, from scores; empty if these are equal."""
-    if scores is None:
-        return np.empty(0)
-    values = as_floats(scores, name="scores", shape=(count,))
-    if (values < 0).any():
-        raise InputError(
-            f"keypoint {int(np.argmax(values < 0))} has the score {values.min():g}",
-            where="scores",
-            fix="give numbers that are not negative",
-        )
-    if not np.ptp(values) > 0:
-        return np.empty(0)
-    shares = values + _LEAST_CONFIDENCE * values.max()
-    return np.asarray(shares / shares.sum())

@@ -11,7 +11,14 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_points, is_number, worker_count
+from cadalign.arrays import (
+    FloatArray,
+    IntArray,
+    as_floats,
+    as_points,
+    is_number,
+    worker_count,
+)
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
 from cadalign.geometry.alignment import describe_plane
@@ -25,6 +32,7 @@ T = TypeVar("T")
 
 _SAME_DIGITS = 6  # decimals that equal keypoints share
 _MOST_COMPARED = 64  # keypoints: among more, a duplicate changes little
+_LEAST_WEIGHT = 0.01  # relative to the largest, so that every keypoint can be drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +187,23 @@ def whitening_by(information: FloatArray) -> FloatArray:
     a = np.sqrt(information[:, 0, 0])
     b = information[:, 0, 1] / a
     return np.stack([a, b, np.sqrt(information[:, 1, 1] - b * b)], axis=1)
+
+
+def sample_weights(scores: npt.ArrayLike | None, count: int) -> FloatArray:
+    """Probabilities of keypoints (n,) in a sample, from scores; empty if these are equal."""
+    if scores is None:
+        return np.empty(0)
+    values = as_floats(scores, name="scores", shape=(count,))
+    if (values < 0).any():
+        raise InputError(
+            f"keypoint {int(np.argmax(values < 0))} has the score {values.min():g}",
+            where="scores",
+            fix="give numbers that are not negative",
+        )
+    if not np.ptp(values) > 0:
+        return np.empty(0)
+    shares = values + _LEAST_WEIGHT * values.max()
+    return np.asarray(shares / shares.sum())
 
 
 class Solutions(NamedTuple):

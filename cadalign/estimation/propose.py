@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from itertools import combinations
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.prior import Lenses, is_exact
 from cadalign.estimation.problem import Inits, Problem
+from cadalign.estimation.problems import sample_weights
 from cadalign.estimation.starts import Start, Starts, rig_pose, starts_of
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
 from cadalign.solvers.joint.evidence import Evidence, Shape
@@ -23,7 +24,6 @@ _MOST_PER_FOCAL = 8  # starts at each focal length of the grid, for one pose
 _MOST_PER_FOCAL_OF_SEVERAL = 3  # the same for several poses
 _SAME_BRANCH = 0.6  # largest chord between rotations of one minimum at neighbouring focal lengths
 _INLIER_RATIO = 0.4
-_LEAST_CONFIDENCE = 0.01  # relative to the largest, so that every keypoint can be drawn
 _LIMIT = 9.0  # squared whitened residual of a keypoint that supports a hypothesis
 _REFINED = 8
 
@@ -58,7 +58,6 @@ def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
     first, ransac = _start(init, evidence), problem.ransac
     if ransac is None:
         return starts_of(evidence, first)
-    trusted = [cast("FloatArray | None", view.scores) for view in problem.views]
     starts = starts_of(add_cauchy_loss(evidence), first)
     if evidence.rig.pose.max() > 0:
         return starts
@@ -66,7 +65,7 @@ def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
         [
             rig_pose(pose, camera)
             for view, camera in enumerate(evidence.rig.cam_from_rig)
-            for pose in _hypotheses(evidence, view, ransac, trusted[view])
+            for pose in _hypotheses(evidence, view, ransac, _weights_of(problem, view))
         ]
     ).reshape(-1, 12)
     count, focals = len(samples), starts.log_focals.shape[1]
@@ -124,38 +123,42 @@ def add_cauchy_loss(evidence: Evidence) -> Evidence:
 
 
 def _hypotheses(
-    evidence: Evidence, view: int, ransac: RansacOptions, scores: FloatArray | None
+    evidence: Evidence, view: int, ransac: RansacOptions, weights: tuple[float, ...]
 ) -> FloatArray:
     """Camera poses (S, 12) from small samples of one view's keypoints, the best supported first."""
     given = keypoints_of(evidence, view)._replace(loss=LINEAR)
     count, size = len(given.points), SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
     if count < size:
         return np.empty((0, 12))
-    poses, supports = rigid_hypotheses(given, _samples(count, size, ransac, scores), _LIMIT)
+    poses, supports = rigid_hypotheses(given, _samples(count, size, ransac, weights), _LIMIT)
     order = np.argsort(supports)[:_REFINED]
     return poses[order[np.isfinite(supports[order])], :12]
 
 
-def _samples(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
-    """Samples (S, size): all, or enough for 40 % inliers, half of them weighted by scores."""
+def _weights_of(problem: Problem, number: int) -> tuple[float, ...]:
+    """The weights of a view's keypoints in samples, in the order of the evidence."""
+    view = problem.views[number]
+    weights = sample_weights(view.scores, len(view.keypoint_ids)).tolist()
+    rows = problem.prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
+    return tuple(weights[place] for place in np.argsort(rows, kind="stable") if weights)
+
+
+def _samples(count: int, size: int, ransac: RansacOptions, weights: tuple[float, ...]) -> IntArray:
+    """Samples (S, size): all, or enough for 40 % inliers, half of them weighted."""
     without = math.log(1 - ransac.success_prob) / math.log1p(-(_INLIER_RATIO**size))
     wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
     if math.comb(count, size) <= wanted:
         return np.array(list(combinations(range(count), size)))
-    weights = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
     return _random_samples(count, size, wanted, ransac.seed, weights)
 
 
 @lru_cache(maxsize=16)  # reused at every focal length and in every diagnosis
 def _random_samples(
-    count: int, size: int, wanted: int, seed: int, scores: tuple[float, ...] | None
+    count: int, size: int, wanted: int, seed: int, weights: tuple[float, ...]
 ) -> IntArray:
     rng = np.random.default_rng(seed)
-    weights = None
-    if scores is not None:
-        weights = np.array(scores) + _LEAST_CONFIDENCE * max(scores)
-        weights = weights / weights.sum()
     draws = [
-        rng.choice(count, size, replace=False, p=weights if k % 2 else None) for k in range(wanted)
+        rng.choice(count, size, replace=False, p=(weights or None) if k % 2 else None)
+        for k in range(wanted)
     ]
     return read_only(np.unique(np.sort(draws, axis=1), axis=0))

@@ -11,7 +11,7 @@ import pytest
 from support.scenes import CAMERA, around, keypoints
 
 from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
-from cadalign.errors import DegenerateError, NoConsensusError
+from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
 from cadalign.shapes.model import ShapeModel
@@ -269,6 +269,18 @@ class TestOutliers:
         view = View(CAMERA, pixels, sigma=0.5, scores=scores)
         result = align(model, view, ransac=RansacOptions(minimal=minimal))
         assert np.flatnonzero(~result.inliers).tolist() == wrong
+        order = np.random.default_rng(1).permutation(16)
+        mixed = View(
+            CAMERA, pixels[order], ids=order.tolist(), sigma=0.5, scores=scores[order].tolist()
+        )
+        again = align(model, mixed, ransac=RansacOptions(minimal=minimal))
+        np.testing.assert_array_equal(again.alignment.vector, result.alignment.vector)
+
+    def test_confidences_are_not_negative(self) -> None:
+        pixels = CAMERA.project(truth_of((1.0, 1.0, 1.0)).apply(keypoints(16)))
+        view = View(CAMERA, pixels, scores=[-1.0] + [1.0] * 15)
+        with pytest.raises(InputError, match="keypoint 0 has the score -1"):
+            align(spreads(0.01, count=16), view, ransac=RansacOptions())
 
     def test_inliers_are_in_the_order_of_the_view(self) -> None:
         model = spreads(0.01, count=16)

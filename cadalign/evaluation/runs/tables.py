@@ -209,12 +209,11 @@ class Run:
     @cached_property
     def cells(self) -> Cells:
         """Columns of the results, and ``seconds``, NaN if unknown."""
-        cells = {name: self.column(name) for name in self.results.column_names}
+        cells: Cells = {
+            name: np.asarray(self.results[name].to_numpy(zero_copy_only=False))
+            for name in self.results.column_names
+        }
         return {**cells, "seconds": self.seconds}
-
-    def column(self, name: str) -> npt.NDArray[Any]:
-        """A column of the results."""
-        return np.asarray(self.results[name].to_numpy(zero_copy_only=False))
 
     def records(self, columns: Columns) -> Iterator[dict[str, Any]]:
         """Rows of the table of instance records; none for runs without records."""

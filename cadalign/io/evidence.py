@@ -248,7 +248,8 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     keypoints = {row: each for row, each in enumerate(read.keypoints) if is_found[row]}
     for row, each in keypoints.items():
         if needs_xyz and each.xyz is None:
-            raise DataError("missing", where=f"keypoints[{row}].xyz")
+            fix = "give it, or name a category as `shape`"
+            raise DataError("missing", where=f"keypoints[{row}].xyz", fix=fix)
     places = [each.xyz or (0, 0, 0) for each in keypoints.values()]
     depths = np.array([each.depth for each in keypoints.values()], dtype=float)
     names, ids = _column(keypoints, "name"), _column(keypoints, "semantic_id")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -28,6 +28,7 @@ from cadalign.shapes.parts import (
     check_axis,
     check_ids,
     check_text,
+    plain_name,
 )
 
 if TYPE_CHECKING:
@@ -108,7 +109,6 @@ class ShapeModel:
             raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
-            object.__setattr__(self, "up_axis", str(self.up_axis))
         if self.training is not None and self.training.points_3d.shape[1] != len(ids):
             what = f"{self.training.points_3d.shape[1]} keypoints for {len(ids)} ids"
             raise InputError(what, where="training")
@@ -118,16 +118,27 @@ class ShapeModel:
         if freedom is not None and (not is_number(freedom) or freedom <= 2):
             what = f"{freedom!r} is not a number above 2, nor None"
             raise InputError(what, where="degrees_of_freedom")
-        object.__setattr__(self, "degrees_of_freedom", freedom and float(freedom))
-        object.__setattr__(self, "inflation", float(self.inflation))
-        for name in ("category", "unit"):
-            object.__setattr__(self, name, check_text(getattr(self, name), name))
-        if self.names and len(check_ids(self.names, "names")) != len(ids):
-            raise InputError(f"{len(self.names)} for {len(ids)} keypoints", where="names")
-        if not all(0 <= row < len(ids) for line in self.lines for row in line):
-            raise InputError(f"a row is not below {len(ids)}", where="lines")
-        object.__setattr__(self, "ids", ids)
-        object.__setattr__(self, "components", tuple(self.components))
+        names = tuple(check_text(name, f"names[{row}]") for row, name in enumerate(self.names))
+        if names and len(check_ids(names, "names")) != len(ids):
+            raise InputError(f"{len(names)} for {len(ids)} keypoints", where="names")
+        for row, line in enumerate(self.lines):
+            if len(line) != 2 or not {*line} <= {*range(len(ids))}:
+                what = f"{quote(line)} is not a pair of rows below {len(ids)}"
+                raise InputError(what, where=f"lines[{row}]")
+        checked = {
+            "category": check_text(self.category, "category"),
+            "ids": ids,
+            "components": tuple(self.components),
+            "up_axis": self.up_axis and str(self.up_axis),
+            "unit": check_text(self.unit, "unit"),
+            "inflation": float(self.inflation),
+            "degrees_of_freedom": freedom and float(freedom),
+            "names": names,
+            "lines": tuple((int(start), int(end)) for start, end in self.lines),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        self.resolve(ids)  # refuses a name or id of two keypoints
 
     @classmethod
     def learn(
@@ -334,26 +345,47 @@ class ShapeModel:
         parts = [(each.weight, each.mean, each.covariance) for each in self.components]
         return Gaussians(*map(np.array, zip(*parts, strict=True)))
 
-    def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:
-        """Rows of the keypoints with the given ids or names, (n,) int.
+    def resolve(
+        self,
+        ids: Collection[Hashable] | None = None,
+        names: Collection[str] | None = None,
+        *,
+        where: str | None = "ids",
+    ) -> tuple[KeypointId | None, ...]:
+        """Find the shape's ids of all keypoints of an object.
 
-        Raises
-        ------
-        InputError
-            If ids are unknown; the message names them.
+        An id may be a name. Of ids and names, the names count if the shape has one of them: ids may
+        be a file's own numbers. Case is ignored in names, ``_`` and ``-`` are equal to a space.
+
+        Raises InputError for keypoints that the shape lacks; without ``where``, they are None.
         """
-        row_of = {
-            label: row for labels in (self.names, self.ids) for row, label in enumerate(labels)
-        }
-        wanted = [label.item() if isinstance(label, np.generic) else label for label in ids]
-        missing = [label for label in wanted if label not in row_of]
-        if missing:
-            raise InputError(
-                f"{self.category} has no keypoint {', '.join(quote(each) for each in missing[:8])}",
-                where=where,
-                fix=f"known are {quote(list(self.names or self.ids))}",
-            )
-        return np.array([row_of[label] for label in wanted], dtype=np.int64)
+        found = tuple(self._id_of.get(plain_name(each)) for each in names or ())
+        if ids is not None and all(own is None for own in found):
+            found = tuple(self._id_of.get(plain_name(each)) for each in ids)
+        given = ids if names is None else names
+        if given is None:
+            raise InputError("the keypoints have no semantic_id and no name", where=where)
+        labels = [each.item() if isinstance(each, np.generic) else each for each in given]
+        missing = [quote(each) for each, own in zip(labels, found, strict=True) if own is None]
+        if missing and where is not None:
+            what = f"{self.category} has no keypoint {', '.join(missing[:8])}"
+            fix = f"leave out what it lacks, or give one of {quote(list(self.names or self.ids))}"
+            raise InputError(what, where=where, fix=fix)
+        return found
+
+    def rows(self, ids: Collection[Hashable], *, where: str = "ids") -> IntArray:
+        """Rows of the keypoints with the given ids or names, (n,) int; see `resolve`."""
+        return np.array(list(map(self.ids.index, self.resolve(ids, where=where))), dtype=np.int64)
+
+    @cached_property
+    def _id_of(self) -> dict[Hashable, KeypointId]:
+        """Ids by id and by name, in plain form."""
+        id_of = dict[Hashable, KeypointId]()
+        for row, label in (*enumerate(self.ids), *enumerate(self.names)):
+            if id_of.setdefault(plain_name(label), self.ids[row]) != self.ids[row]:
+                what, fix = f"{quote(label)} is also another keypoint", "give each keypoint its own"
+                raise InputError(what, where="names" if self.names else "ids", fix=fix)
+        return id_of
 
     def nearest(self, points_3d: npt.ArrayLike) -> int:
         """Row in ``training`` of the model with the nearest keypoints.

@@ -101,7 +101,7 @@ def take(state: Annotation, *, keypoint: Index, uv: Point2) -> ActionOutcome:
 
 def skip(state: Annotation) -> ActionOutcome | None:
     """Propose another keypoint; if all were skipped, propose them anew."""
-    proposed = state.proposed(state.alignment())
+    proposed = state.next_keypoint(state.alignment())
     if proposed is None:
         state.skipped.clear()
     else:
@@ -135,7 +135,7 @@ def pick(
     if near is None:
         point = model.pick(model.from_display(origin), direction)
         if point is None:
-            return ActionOutcome(message=model.missed)
+            return ActionOutcome(message=model.miss_message)
         near = registry.find(point.xyz)
         near = registry.add(point) if near is None else near
     return place_keypoint(state, keypoint=near, pair=pair)

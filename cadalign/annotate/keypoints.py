@@ -74,7 +74,7 @@ class KeypointRegistry:
         own = None if point.semantic_id is None else self._points.get(point.semantic_id)
         return own is not None and self.find(point.xyz, among=[own]) is not None
 
-    def same(self, point: ModelKeypoint) -> int | None:
+    def find_by_name(self, point: ModelKeypoint) -> int | None:
         """Find the id of the keypoint with the point's name, or with its id if it has no name."""
         for number, own in self:
             if own.name == point.name if point.name else number == point.semantic_id:
@@ -160,15 +160,27 @@ class ObjectShape:
         return "model units" if self.learned is None else self.learned.unit
 
     def id_of(self, point: ModelKeypoint) -> KeypointId | None:
-        """Return the id of a model's point in the estimate; None if the learned shape lacks it."""
+        """Return the id of a model's point in the estimate; None if the learned shape lacks it.
+
+        The learned shape knows the point by its name, otherwise by its semantic id.
+        """
         if self.learned is None:
             return point.semantic_id
-        label: KeypointId | None = point.name if self.is_named else point.semantic_id
-        return label if label in self.ids else None
+        ids, names = self.learned.ids, self.learned.names
+        known: dict[KeypointId | None, KeypointId]
+        known = dict(zip((*ids, *names), (*ids, *ids), strict=False))
+        return known.get(point.name, known.get(point.semantic_id))
 
     def knows(self, points: Sequence[ModelKeypoint]) -> BoolArray:
-        """Return a mask (n,) of the points that the shape has; only their pairs count."""
-        return np.array([self.id_of(point) is not None for point in points], dtype=bool)
+        """Return a mask (n,) of the points that the shape has, each once; their pairs count."""
+        labels = [self.id_of(point) for point in points]
+        firsts = [label not in (None, *labels[:row]) for row, label in enumerate(labels)]
+        return np.array(firsts, dtype=bool)
+
+    def name_of(self, point: ModelKeypoint) -> str:
+        """Return the name of a point that the shape has, as the shape calls it."""
+        names = () if self.learned is None else self.learned.names
+        return names[self.ids.index(self.id_of(point))] if names else point.name
 
 
 def positions_of(points: Iterable[ModelKeypoint]) -> FloatArray:

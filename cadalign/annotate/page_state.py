@@ -75,7 +75,7 @@ def page_state(
             "model": {
                 "key": state.model.shape.category or "",
                 "is_skeleton": state.model.is_skeleton,
-                "proposed": state.proposed(live),
+                "proposed": state.next_keypoint(live),
                 "categories": CATEGORIES if state.model.can_exchange else (),
             },
             "alignment": _alignment(state, live, is_ready=session.ready),

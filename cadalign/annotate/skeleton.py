@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +27,7 @@ _PRISM = np.array(
 class Skeleton(ClickableModel):
     """The mean keypoints of a learned shape with bars between them; only keypoints are clicked."""
 
-    missed = "Click on one of the keypoints, the white points."
+    miss_message = "Click on one of the keypoints, the white points."
 
     def __init__(self, shape: ShapeModel) -> None:
         points = shape.mean[: len(shape.ids)]
@@ -51,7 +50,7 @@ def open_skeleton(shape: ObjectShape) -> MarkedModel:
     registry = KeypointRegistry(fixed=True)
     for point in ModelKeypoints.from_shape(learned).keypoints:
         registry.add(point)
-    return MarkedModel(None, Skeleton(learned), registry, shape, Path())
+    return MarkedModel(Skeleton(learned), registry, shape)
 
 
 def next_row(

@@ -295,10 +295,15 @@ def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
     return values
 
 
-def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
-    """Convert camera, keypoints, photo and evidence of an image to the fields of a file."""
+def write_image_fields(
+    image: ObservedImage, folder: Path | None, *, needs_xyz: bool = True
+) -> dict[str, Any]:
+    """Convert camera, keypoints, photo and evidence of an image to the fields of a file.
+
+    Unless it ``needs_xyz``, they are left out if all are zero.
+    """
     columns = {
-        "xyz": image.points_3d,
+        "xyz": image.points_3d if needs_xyz or image.points_3d.any() else None,
         "uv": image.points_2d,
         "sigma": image.sigma,
         "semantic_id": image.ids,

@@ -241,7 +241,8 @@ class Observation(ObservedImage):
 
         Every ``pixel_origin`` is written.
         """
-        written = [write_image_fields(view, folder) for view in self.views]
+        needs_xyz = self.shape is None
+        written = [write_image_fields(view, folder, needs_xyz=needs_xyz) for view in self.views]
         data: dict[str, Any] = {"views": written} if self.others else written[0]
         further = {
             "model": self.model and written_path(self.model, folder=folder),

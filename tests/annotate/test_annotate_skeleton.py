@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import trimesh
 from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, expect
 from support.annotating import opened_page, place_of_pixel, wait
+from support.refusals import refusal_text
 
 from cadalign import Alignment, CadalignError, Camera, Result, ShapeModel
 from cadalign.annotate.actions import perform
@@ -19,6 +21,10 @@ from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main
+from cadalign.datasets import ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.meshes.files import write_mesh
 from cadalign.io.observation import Observation
 
 CAMERA = Camera(800, 600, 900.0, 900.0, 399.5, 299.5)
@@ -200,6 +206,53 @@ def test_another_category_keeps_pairs_of_equal_names(photo: Path) -> None:
             assert {pair["name"] for pair in state["pairs"] if pair["name"]} == names
     with pytest.raises(CadalignError, match="unknown category 'sofa'"):
         perform(session, 0, {"do": "category", "name": "sofa"})
+
+
+def test_keypoints_of_a_skeleton_join_a_cad_model_by_name(photo: Path) -> None:
+    """Their places on the mean shape are nobody's: they are not written."""
+    session = opened(photo)
+    ids = {each["name"]: each["keypoint"] for each in page_state(session, 0)["keypoints"]}
+    shared, other, half = list(ids)[:3]
+    for name, u in ((shared, 10), (other, 30)):
+        perform(session, 0, {"do": "take", "keypoint": ids[name], "uv": [u, 20]})
+    perform(session, 0, {"do": "place_keypoint", "keypoint": ids[half]})
+    path = photo.with_suffix(".json")
+    assert "xyz" not in path.read_text()
+
+    corners = [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.4)]
+    model = photo.with_name("own.obj")
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 3]])
+    write_mesh(model, Mesh(np.array(corners), faces), kind="obj")
+    own = tuple(map(ModelKeypoint, (shared, half, "tip"), corners))
+    ModelKeypoints(own, model).save(model.with_suffix(".keypoints.json"))
+    earlier = json.loads(path.read_text())  # earlier files have places on the mean shape
+    for each in (*earlier["keypoints"], *earlier["unfinished"]["pairs"]):
+        each["xyz"] = [0.1, 0.1, 0.1]
+    for data in (json.loads(path.read_text()), earlier):
+        path.write_text(json.dumps(data))
+        state = page_state(opened(photo, model=model), 0)
+        found = [(pair["name"], pair["uv"] and pair["uv"][0]) for pair in state["pairs"]]
+        assert found == [(shared, 10), ("", 30), (half, None)]
+        assert [each["name"] for each in state["keypoints"]] == [shared, half, "tip"]
+
+
+def test_a_file_of_another_shape_is_refused_and_kept(
+    photo: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    own, path = photo.with_name("own.shape"), photo.with_suffix(".json")
+    replace(ShapeModel.pretrained("chair"), names=()).save(own)
+    perform(opened(photo, str(own)), 0, {"do": "take", "keypoint": 4, "uv": [10, 20]})
+    kept = path.read_bytes()
+    fix = "give that shape, or give another --observation or --out"
+    assert refusal_text(lambda: opened(photo)) == (
+        f"{path}: belongs to the shape {own}, not chair; {fix}"
+    )
+    assert path.read_bytes() == kept
+    state = page_state(opened(photo, str(own)), 0)
+    assert [pair["name"] for pair in state["pairs"]] == ["keypoint 4"]
+    own.unlink()  # deleted, it counts as renamed
+    assert page_state(opened(photo), 0)["model"]["key"] == "chair"
+    assert f"its shape {own} no longer exists, chair is used instead" in caplog.text
 
 
 def test_shapes_from_files_are_not_exchanged(photo: Path) -> None:

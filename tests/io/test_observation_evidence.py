@@ -141,6 +141,12 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
         Observation.load(path)
 
 
+def test_missing_xyz_are_not_written() -> None:
+    bare = [{name: each[name] for name in each if name != "xyz"} for each in KEYPOINTS]
+    data = {**SEEN, "keypoints": bare, "shape": "chair"}
+    assert Observation.from_dict(data).to_dict() == data
+
+
 @pytest.mark.parametrize(
     ("data", "text"),
     [

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import operator
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image, ImageDraw
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 from support.annotating import opened_page, place_of_pixel, wait
 from support.refusals import refusal_text
 
@@ -289,15 +291,46 @@ def test_pairs_without_a_model_take_one_line_each(
     mark_until(session, 8)
     perform(session, 0, {"do": "category", "name": "table"})
     with opened_page(browser, session, width=width, height=700) as page:
-        rows = page.locator(".pairs li")
-        heights = rows.evaluate_all("all => all.map((each) => each.offsetHeight)")
-        assert max(heights) < 34
-        names = "all => all.map((each) => [each.clientWidth, each.scrollWidth])"
-        widths = page.locator(".pairs .name").evaluate_all(names)
-        assert len(widths) >= 3
-        assert all(given >= needed for given, needed in widths)
-        choices = page.locator(".pairs select")
-        assert min(choices.evaluate_all("all => all.map((each) => each.offsetWidth)")) > 200
+        # Found and measured in one step: while solvers are prepared, rows are made anew.
+        measured = "([all, size]) => [...document.querySelectorAll(all)].map((each) => each[size])"
+        assert max(page.evaluate(measured, [".pairs li", "offsetHeight"])) < 34
+        needed = page.evaluate(measured, [".pairs .name", "scrollWidth"])
+        given = page.evaluate(measured, [".pairs .name", "clientWidth"])
+        assert len(needed) >= 3
+        assert all(map(operator.ge, given, needed))
+        assert min(page.evaluate(measured, [".pairs select", "offsetWidth"])) > 200
+
+
+def test_the_skeleton_shown_is_of_the_photos_category(browser: Browser, photo: Path) -> None:
+    """A slow answer replaces no later one, and a failed one is asked for again."""
+    shutil.copy(photo, photo.with_name("second.png"))
+    session = opened(photo.parent, ready=True)
+    perform(session, 1, {"do": "category", "name": "table"})
+    sizes = [
+        3 * int(np.frombuffer(each.model.cad.display_bytes[:4], "<u4")[0])
+        for each in session.photos
+    ]
+    assert sizes[0] != sizes[1]
+    shown = "annotator.model.mesh?.geometry.attributes.position.count === {}"
+    with opened_page(browser, session) as page:
+        wait(page, shown.format(sizes[0]))
+        slow: list[Route] = []
+        page.route("**/model/1?*", lambda route: slow.append(route))
+        page.evaluate("annotator.goTo(1)")
+        wait(page, "annotator.state.image.number === 1")
+        page.evaluate("annotator.goTo(0)")
+        wait(page, shown.format(sizes[0]))
+        with page.expect_response("**/model/1?*"):
+            slow[0].continue_()
+        page.wait_for_timeout(200)
+        assert page.evaluate(shown.format(sizes[0]))
+
+        page.unroute("**/model/1?*")
+        page.route("**/model/1?*", lambda route: route.fulfill(status=422, body="no"), times=1)
+        page.evaluate("annotator.goTo(1)")
+        expect(page.get_by_role("status")).to_contain_text("The model cannot be shown: no")
+        page.evaluate("annotator.api.refresh()")
+        wait(page, shown.format(sizes[1]))
 
 
 @pytest.mark.long

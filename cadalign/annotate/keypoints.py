@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,7 +73,7 @@ class KeypointRegistry:
     def has(self, point: ModelKeypoint) -> bool:
         """True if the keypoint with the point's id has the same position."""
         own = None if point.semantic_id is None else self._points.get(point.semantic_id)
-        return own is not None and self.find(point.xyz, among=[own]) is not None
+        return own is not None and math.dist(own.xyz, point.xyz) <= self._tolerance
 
     def find_by_name(self, point: ModelKeypoint) -> int | None:
         """Find the id of the keypoint with the point's name, or with its id if it has no name."""
@@ -81,16 +82,11 @@ class KeypointRegistry:
                 return number
         return None
 
-    def find(
-        self, xyz: Sequence[float], *, among: Iterable[ModelKeypoint] | None = None
-    ) -> int | None:
+    def find(self, xyz: Sequence[float]) -> int | None:
         """Find the id of the nearest keypoint within the tolerance."""
-        points = list(self._points.values() if among is None else among)
-        if not points:
-            return None
-        gaps = np.linalg.norm(np.array([each.xyz for each in points]) - np.array(xyz), axis=1)
-        nearest = int(np.argmin(gaps))
-        return points[nearest].semantic_id if gaps[nearest] <= self._tolerance else None
+        gaps = {number: math.dist(point.xyz, xyz) for number, point in self}
+        nearest = min(gaps, key=gaps.__getitem__, default=None)
+        return nearest if nearest is not None and gaps[nearest] <= self._tolerance else None
 
     def rename(self, semantic_id: int, name: str) -> None:
         """Rename a keypoint; raises InputError if the name is empty, too long or taken."""

@@ -35,7 +35,7 @@ _MOST_CREASES = 1500
 _MOST_LINES = 3000
 _CREASE_DEG = 30.0
 _LONGEST = 1 / 24  # line [diagonals]: each line is drawn or hidden as a whole
-_BOX_PIECES = 16
+_BOX_PIECES = 16  # of the longest edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +94,8 @@ def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> Float
     """Project the edges of the stretched model's box, in pieces, to pixels (k, 2, 2)."""
     corners = Box.from_model(bounds, alignment).corners
     ends = corners[np.array(BOX_EDGES)]
-    share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
-    points = (ends[:, 0] * (1 - share) + ends[:, 1] * share).transpose(1, 0, 2)
-    lines = np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
-    return project_lines(lines, camera, Alignment.identity())
+    piece = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max() / _BOX_PIECES
+    return project_lines(split_lines(ends, piece), camera, Alignment.identity())
 
 
 def project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:

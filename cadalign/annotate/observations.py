@@ -27,7 +27,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import Document, Point2, convert, name_file, name_part, read_json
+from cadalign.io.documents import Document, Point2, convert, name_file, name_part
 from cadalign.io.evidence import KeypointFields
 from cadalign.io.focal import FocalPrior
 from cadalign.io.images import write_image
@@ -41,10 +41,6 @@ LIKELY_STRETCH = 0.25
 LEAST_JOINT_PAIRS = 3
 """Minimum number of pairs of an alignment with further evidence; fewer need a start."""
 _OTHER_FILE = "give another --observation or --out"
-# Fields of the object, not of one image.
-_OF_THE_OBJECT = (
-    *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
-)
 _OWN_OPTIONS = {"stretch_sigma", "focal_prior", "image"}
 
 
@@ -84,7 +80,7 @@ class ObservationFile:
             nothing = np.empty((0, 3)), np.empty((0, 2))
             self.stored = Observation(*nothing, camera, up_axis=up_axis or "y")
             return Marks(camera, model)
-        stored = self._load()
+        stored = Observation.load(self.path)
         if stored.others:
             what = f"has {len(stored.views)} views, the annotator only opens files of one photo"
             raise DataError(what, where=str(self.path), fix=_OTHER_FILE)
@@ -200,16 +196,6 @@ class ObservationFile:
             write_image(path, np.where(inside, 255, 0).astype(np.uint8))
             self._drawn = marks.mask, path
         return path
-
-    def _load(self) -> Observation:
-        data = read_json(self.path)
-        if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
-            # All pairs were deleted. The view keeps its other fields, the file keeps the rest.
-            of_the_object = {name: data.pop(name) for name in _OF_THE_OBJECT if name in data}
-            with name_file(self.path):
-                data = {"views": [data], **of_the_object}
-                return Observation.from_dict(data, folder=self.path.parent)
-        return Observation.load(self.path)
 
     def _warn_of_options(self, stored: Observation, model: MarkedModel) -> None:
         """Warn of stored options of the fit that the page does not use."""

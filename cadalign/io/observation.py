@@ -108,7 +108,7 @@ def _read_fields(data: Any, folder: Path | None) -> tuple[ObservationFields, Seq
         return read, read.views
     if read.camera is UNSET:
         raise DataError("missing", where="camera")
-    if not read.keypoints and read.init is None and read.mask is None:
+    if "keypoints" not in data and read.init is None and read.mask is None:
         raise DataError("missing", where="keypoints", fix="give keypoints, `mask` or `init`")
     if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
         what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"

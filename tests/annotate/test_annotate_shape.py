@@ -90,7 +90,7 @@ def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path
     # All keypoints except the one that the model lacks.
     assert len(drawn["unmarked"]) == len(drawn["regions"]) == len(shape.ids) - len(used) - 1
     assert len(drawn["lines"]) > 100
-    assert len(drawn["box"]) == 12 * 16
+    assert len(drawn["box"]) > 4 * 16
     labels = [fact["label"] for fact in drawn["facts"]]
     assert labels[:5] == [*(f"Length {axis}" for axis in "xyz"), "Rotation", "Distance"]
 

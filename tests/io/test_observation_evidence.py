@@ -107,6 +107,8 @@ def test_a_mask_needs_no_keypoints() -> None:
             assert read.evidence.mask == Path("mask.png")
     with pytest.raises(DataError, match="keypoints: missing"):
         Observation.from_dict({"camera": CAMERA, "image": "photo.png"})
+    nothing = {**SEEN, "keypoints": []}  # an annotation from which all was deleted
+    assert Observation.from_dict(nothing).to_dict() == nothing
 
 
 @pytest.mark.parametrize("data", [ONE, SEVERAL])

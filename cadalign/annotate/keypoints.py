@@ -140,20 +140,10 @@ class ObjectShape:
         return () if self.learned is None else self.learned.ids
 
     @property
-    def is_named(self) -> bool:
-        """True if the learned keypoints have names, not numbers."""
-        return bool(self.ids) and isinstance(self.ids[0], str)
-
-    @property
     def has_outline(self) -> bool:
         """True if masks and photos are evidence of the shape: a learned one needs meshes."""
         training = None if self.learned is None else self.learned.training
         return self.learned is None or bool(training and training.rows_with_mesh)
-
-    @property
-    def unit(self) -> str:
-        """Unit of lengths."""
-        return "model units" if self.learned is None else self.learned.unit
 
     def id_of(self, point: ModelKeypoint) -> KeypointId | None:
         """Return the id of a model's point in the estimate; None if the learned shape lacks it.

@@ -268,12 +268,13 @@ def _extent(
 
 def _distance(result: Result, shape: ObjectShape) -> tuple[str, str]:
     covariance, distance = result.covariance, float(np.linalg.norm(result.alignment.translation))
+    unit = "model units" if shape.learned is None else shape.learned.unit
     if covariance is None or not distance > 0:
-        return f"{distance:.3g}", shape.unit
+        return f"{distance:.3g}", unit
     relative = distance_deviation(result.alignment, covariance)
     if relative > NOT_DETERMINED:
         return _UNDETERMINED
-    return f"{distance:.3g} ± {short(relative * distance)}", shape.unit
+    return f"{distance:.3g} ± {short(relative * distance)}", unit
 
 
 def _focal(result: Result, *, is_assumed: bool) -> tuple[str, str]:

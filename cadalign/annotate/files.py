@@ -34,8 +34,7 @@ class SessionOptions:
     image: Path
     """A photo, or a folder of photos."""
     model: Path | None = None
-    """OBJ, PLY, GLB, glTF, STL or OFF file. Without a model, the keypoints of the
-    shape are marked."""
+    """CAD model; without it, the keypoints of the shape are marked."""
     observation: Path | None = None
     """Observation file of a single photo, by default beside the photo. An existing file is
     continued."""

@@ -69,14 +69,13 @@ class ObservationFile:
     _content: LastContent = field(default_factory=LastContent, repr=False)
     _drawn: tuple[ObjectMask, Path] | None = None  # the last mask that was written, and its file
 
-    def read(self, model: MarkedModel, given: Camera | None, *, up_axis: Any = None) -> Marks:
+    def read(self, model: MarkedModel, camera: Camera, *, up_axis: Any = None) -> Marks:
         """Read the marks of an earlier session, and add new points to the model.
 
-        ``given`` is the camera if there is no file. Raises a CadalignError if a file is invalid.
+        The ``camera`` is for a new file. Raises a CadalignError if a file is invalid.
         """
         self._content.note(self.path)
         if not self.path.exists():
-            camera = camera_of(self.photo, given)
             nothing = np.empty((0, 3)), np.empty((0, 2))
             self.stored = Observation(*nothing, camera, up_axis=up_axis or "y")
             return Marks(camera, model)
@@ -157,10 +156,9 @@ class ObservationFile:
         depths = np.array([np.nan if pair.depth is None else pair.depth for pair in pairs])
         has_depths = bool(np.isfinite(depths).any())
         mask_sigma = None if marks.mask is None else marks.mask.sigma
-        mask = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
-        evidence = msgspec.structs.replace(self.stored.evidence, **mask)
+        changes = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
         if not has_depths:  # all keypoints with depths may be deleted
-            evidence = msgspec.structs.replace(evidence, depth_sigma=None)
+            changes["depth_sigma"] = None
         halves = [_half_of(pair, model) for pair in marks.pairs if pair not in pairs]
         return replace(
             self.stored,
@@ -174,7 +172,7 @@ class ObservationFile:
             scores=_fill_missing(pair.score for pair in pairs),
             image=self.photo.path,
             depths=depths if has_depths else None,
-            evidence=evidence,
+            evidence=msgspec.structs.replace(self.stored.evidence, **changes),
             model=model.path,
             fit_options=options,
             shape=model.shape.path,

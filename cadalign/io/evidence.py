@@ -5,10 +5,8 @@ docs/formats/observation.md describes the format.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -239,7 +237,7 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     """
     for name in ("name", "semantic_id"):
         require_unique(read.keypoints, name)
-    camera = _camera(read.camera)
+    camera = Camera.from_dict(read.camera)
     pixels = [each.uv or (None, None) for each in read.keypoints]
     points_2d = np.array(pixels, dtype=float).reshape(-1, 2)  # NaN for None
     is_found = ~missing_pixels(points_2d)
@@ -265,19 +263,6 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
         not_found=tuple(np.flatnonzero(~is_found).tolist()),
         evidence=ImageEvidence(**read.given),
     )
-
-
-def _camera(form: Any) -> Camera:
-    """Convert a camera's fields; the result is cached, since many images share a camera."""
-    try:
-        return _camera_of(json.dumps(form))
-    except (TypeError, ValueError, RecursionError):  # of NumPy's arrays
-        return Camera.from_dict(form)
-
-
-@lru_cache(maxsize=64)
-def _camera_of(text: str) -> Camera:
-    return Camera.from_dict(json.loads(text))
 
 
 def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:

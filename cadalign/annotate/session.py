@@ -123,12 +123,9 @@ class Annotation:
     def exchange_shape(self, shape: ObjectShape) -> None:
         """Mark the keypoints of another shape; pairs of equal names stay, others lose theirs."""
         model, marks, before = open_skeleton(shape), self.marks, self.model.registry
-        changed = [
-            each
-            if each.keypoint is None
-            else replace(each, keypoint=model.registry.find_by_name(before[each.keypoint]))
-            for each in marks.pairs
-        ]
+        found: dict[int | None, int | None]
+        found = {number: model.registry.find_by_name(before[number]) for number in marks.keypoints}
+        changed = [replace(each, keypoint=found.get(each.keypoint)) for each in marks.pairs]
         kept = [each for each in changed if each.uv is not None or each.keypoint is not None]
         self.record(replace(marks, model=model, pairs=tuple(kept), start=None))
 

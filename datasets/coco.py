@@ -124,10 +124,8 @@ def _parse_file(data: Any) -> _File:
     """Parse the file's lists; a detector's result has neither images nor categories."""
     if isinstance(data, list):
         return _File(data)
-    if not isinstance(data, dict):
-        raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
-    if "annotations" not in data:
-        raise DataError("missing", where="annotations", fix=_FIX)
+    if not isinstance(data, dict) or "annotations" not in data:
+        raise DataError("there are no annotations", fix=_FIX)
     found: _File = convert(data, _File)
     return found
 
@@ -191,18 +189,13 @@ def _parse_points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
     if isinstance(value, _AxisKeypoints):
         if len(value.x) != len(value.y):
             raise DataError(f"{len(value.y)} values, but x has {len(value.x)}", where=f"{where}.y")
-        return np.column_stack([_floats(value.x), _floats(value.y)]), value.visible
-    flat = _floats(convert(value, list[float | None], where=where))
+        return np.array([value.x, value.y], dtype=float).T.copy(), value.visible  # NaN for None
+    flat = np.array(convert(value, list[float | None], where=where), dtype=float)
     if not len(flat) or len(flat) % 3:
         what = f"expected x, y and visibility or score of each keypoint, got {len(flat)} numbers"
         raise DataError(what, where=where, fix=_FIX)
     numbers = np.reshape(flat, (-1, 3))
     return np.ascontiguousarray(numbers[:, :2]), numbers[:, 2]
-
-
-def _floats(values: Any) -> FloatArray:
-    """Convert numbers to an array, with NaN for None."""
-    return np.array(values, dtype=float)
 
 
 def _number(entry: _Object, name: str, where: str) -> float | None:
@@ -251,23 +244,11 @@ def decode_segmentation(segmentation: Any, *, width: int, height: int) -> BoolAr
     if isinstance(segmentation, dict):
         mask = _decode_runs(convert(segmentation, _Runs, "segmentation"), width, height)
     else:
-        mask = _fill_polygons(_parse_polygons(segmentation), width, height)
+        given = convert(segmentation, list[list[Finite]], "segmentation")
+        mask = _fill_polygons(given, width, height)
     if not mask.any():
         raise DataError("the mask is empty", where="segmentation", fix=_MASK_FIX)
     return mask
-
-
-def _parse_polygons(segmentation: Any) -> list[list[float]]:
-    """Parse polygons; those of fewer than three points are ignored if there are others."""
-    given = convert(segmentation, list[list[Finite]], "segmentation")
-    kept = [polygon for polygon in given if len(polygon) >= _LEAST_NUMBERS]
-    if given and not kept:
-        what = f"{quote(given[0])} is not a polygon of three or more points"
-        raise DataError(what, where="segmentation[0]", fix=_MASK_FIX)
-    if len(kept) < len(given):
-        text = "segmentation: %d of %d polygons have fewer than three points; ignored"
-        logger.warning(text, len(given) - len(kept), len(given))
-    return kept
 
 
 def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:
@@ -309,8 +290,8 @@ def _fill_polygons(polygons: Sequence[Sequence[float]], width: int, height: int)
 
     for number, polygon in enumerate(polygons):
         where = f"segmentation[{number}]"
-        if len(polygon) % 2:
-            what = f"expected x, y of each point, got {len(polygon)} numbers"
+        if len(polygon) % 2 or len(polygon) < _LEAST_NUMBERS:
+            what = f"expected x, y of three or more points, got {len(polygon)} numbers"
             raise DataError(what, where=where, fix=_MASK_FIX)
         points = np.reshape(polygon, (-1, 2))
         # pycocotools' memory grows with the length of the outline.

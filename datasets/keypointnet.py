@@ -98,12 +98,12 @@ class AnnotatedModel:
         mesh = load_mesh(self.mesh_path)
         if not check:
             return mesh
-        fix = "give the mesh of ShapeNetCore.v2, or load this one with check=False"
+        given, fix = self.keypoints, "give ShapeNetCore.v2's mesh, or load this with check=False"
         try:
-            rebuilt = self.keypoints.locate(mesh)
+            rebuilt = mesh.surface_points(given.face_index, given.barycentric)
         except InputError as error:
             raise DataError(error.what, where=where, fix=fix) from None
-        gaps = np.linalg.norm(rebuilt - self.keypoints.xyz, axis=1)
+        gaps = np.linalg.norm(rebuilt - given.xyz, axis=1)
         worst = int(np.argmax(gaps))
         low, high = mesh.bounds
         # "not <=" also refuses NaN, which a damaged mesh can give.

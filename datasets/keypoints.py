@@ -15,7 +15,6 @@ from msgspec import Meta
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
@@ -60,24 +59,23 @@ class Keypoints:
         """Iterate over the (id, position (3,)) of each keypoint."""
         return zip(self.ids.tolist(), self.xyz, strict=True)
 
-    def locate(self, mesh: Mesh) -> FloatArray:
-        """Compute the positions from faces and barycentric coordinates, (k, 3) float.
 
-        Raises InputError if a face index is not a face of the mesh.
-        """
-        return mesh.surface_points(self.face_index, self.barycentric)
-
-
-@dataclass(frozen=True, eq=False)
-class Circle:
+class Circle(ForeignDocument, eq=False):
     """A circle of equivalent keypoints, such as a bottle's rim."""
 
-    center: FloatArray
+    center: _Place
     """(3,), the centre [model units]."""
-    radius: float
+    radius: Annotated[float, Meta(ge=0, le=1e30)]
     """The radius [model units]."""
-    normal: FloatArray
+    normal: Point3
     """(3,), unit vector along the axis."""
+
+    def __post_init__(self) -> None:
+        if not any(self.normal):
+            raise InputError("the vector has length 0", where="normal")
+        axis = np.array(self.normal) / np.abs(self.normal).max()  # its square is finite
+        x, y, z = (axis / np.linalg.norm(axis)).tolist()
+        self.normal = x, y, z
 
 
 @dataclass(frozen=True)
@@ -121,16 +119,6 @@ class _Keypoint(ForeignDocument):
     mesh_info: _MeshInfo
 
 
-class _Circle(ForeignDocument):
-    center: _Place
-    radius: Annotated[float, Meta(ge=0, le=1e30)]
-    normal: Point3
-
-    def __post_init__(self) -> None:
-        if not any(self.normal):
-            raise InputError("the vector has length 0", where="normal")
-
-
 class _Reflection(ForeignDocument):
     kp_indexes: tuple[Count, Count]  # rows of the keypoints
 
@@ -138,7 +126,7 @@ class _Reflection(ForeignDocument):
 class _Rotation(ForeignDocument):
     kp_indexes: list[Count]
     is_circle: bool
-    circle: Any = None  # a _Circle if is_circle, else anything
+    circle: Any = None  # a Circle if is_circle, else anything
 
 
 class _Symmetries(ForeignDocument):
@@ -199,11 +187,7 @@ def _symmetries(read: _Symmetries) -> Symmetries:
     for row, item in enumerate(read.rotation):
         circle = None
         if item.is_circle:
-            found = convert(item.circle, _Circle, where=f"symmetries.rotation[{row}].circle")
-            normal = np.array(found.normal)
-            normal /= np.abs(normal).max()  # so that its square is finite
-            normal = _freeze(normal / np.linalg.norm(normal))
-            circle = Circle(_freeze(found.center), found.radius, normal)
+            circle = convert(item.circle, Circle, where=f"symmetries.rotation[{row}].circle")
         rotations.append(RotationalSymmetry(keypoints=tuple(item.kp_indexes), circle=circle))
     return Symmetries(tuple(item.kp_indexes for item in read.reflection), tuple(rotations))
 
@@ -274,10 +258,11 @@ def _axis_of_revolution(
     circles = [(r.keypoints, r.circle) for r in symmetries.rotations if r.circle is not None]
     if not circles:
         return None
-    first = circles[0][1].normal
-    cosine = np.cos(np.radians(_AXIS_TOLERANCE_DEG))
-    same = [(rows, c) for rows, c in circles if abs(float(c.normal @ first)) > cosine]
-    mean = np.sum([c.normal * np.sign(c.normal @ first) for _, c in same], axis=0)
+    normals = np.array([c.normal for _, c in circles])
+    cosines, cosine = normals @ normals[0], np.cos(np.radians(_AXIS_TOLERANCE_DEG))
+    rows = np.flatnonzero(np.abs(cosines) > cosine)
+    same = [circles[row] for row in rows]
+    mean = np.sign(cosines[rows]) @ normals[rows]
     axis = mean / np.linalg.norm(mean)
     nearest = int(np.argmax(np.abs(axis)))
     if abs(axis[nearest]) > cosine:  # ShapeNet's models are turned about their coordinate axes

@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
-from cadalign.datasets.records import RecordSet
-from cadalign.errors import CadalignError, DataError
+from cadalign.datasets.records import RecordSet, collect_error
+from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -72,21 +72,15 @@ class CadModel:
     bounds: FloatArray | None = None
     """(2, 3), lowest and highest corner of the annotated bounding box [model units], or None."""
 
-    def find_mesh(self) -> Mesh | None:
-        """Read the mesh; None if there is none. Raises DataError if it cannot be read."""
-        if isinstance(self.mesh, Path):
-            return load_mesh(self.mesh)
-        return self.mesh() if callable(self.mesh) else self.mesh
-
     def load_mesh(self) -> Mesh:
         """Read the mesh; raises DataError if it is missing or cannot be read."""
-        mesh = self.find_mesh()
+        mesh = self.mesh() if callable(self.mesh) else self.mesh
         if mesh is None:
             raise DataError("there is no mesh of this model", where=f"model {self.model_id}")
-        return mesh
+        return load_mesh(mesh) if isinstance(mesh, Path) else mesh
 
     def load_keypoints(self) -> NamedPoints | None:
-        """Read the named keypoints; None if there are none. Raises DataError as `find_mesh`."""
+        """Read the named keypoints; None if there are none. Raises DataError as `load_mesh`."""
         return self.keypoints() if callable(self.keypoints) else self.keypoints
 
 
@@ -101,8 +95,6 @@ class Truth:
     camera: Camera | None = None
     """The camera that the pose was annotated with, if it is not the photo's. The pose fits the
     photo under this camera, but its translation and this focal length are only conventions."""
-    metres: float | None = None
-    """Length of one unit of the camera frame [m]; None if the size is unknown."""
 
     @property
     def rotation(self) -> FloatArray | None:
@@ -204,21 +196,13 @@ def read_each(
     ``read`` converts the record at a position to an object, or to None to leave it out. ``where``
     is the place of the records, for messages.
     """
-    found: list[PhotoObject] = []
-    problems: list[DataError] = []
+    found, problems = list[PhotoObject](), dict[str, DataError]()
     for number, record in enumerate(records):
-        try:
+        place = f"{where}, object {number}"
+        with collect_error(place, problems), name_file(place):
             each = read(number, record)
-        except CadalignError as error:
-            place = f"{where}, object {number}"
-            if error.where:
-                has_file = error.where.startswith(where)
-                place = error.where if has_file else f"{place}: {error.where}"
-            problems.append(DataError(error.what, where=place, fix=error.fix))
-            continue
-        if each is not None:
-            found.append(each)
-    return tuple(found), tuple(problems)
+            found += [] if each is None else [each]
+    return tuple(found), tuple(problems.values())
 
 
 def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from cadalign.errors import CadalignError, DataError, quote
-from cadalign.io.documents import read_json
+from cadalign.io.documents import name_file, read_json
 from cadalign.io.files import damage_error
 
 logger = logging.getLogger("cadalign")
@@ -103,10 +103,9 @@ class RecordSet(ABC, Generic[T]):
                 return self.read(index)
         except DataError:
             raise
-        except CadalignError as error:  # a value that a camera or a pose refuses
-            where = f"{self.root}, {self.names[index][:200]}"
-            where += f": {error.where}" if error.where else ""
-            raise DataError(error.what, where=where, fix=error.fix) from None
+        except CadalignError:  # a value that a camera or a pose refuses
+            with name_file(f"{self.root}, {self.names[index][:200]}"):
+                raise
 
     def _log_problem(self, name: str, error: DataError) -> None:
         if name not in self.problems and len(self.problems) <= _LOGGED:

@@ -158,7 +158,8 @@ class Scan2CAD(PhotoDataset):
         """Read the photo at a position, counted from 0."""
         scan, frame = self._records[index]
         camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
-        cam_from_world = _compose(cam_from_scan, _invert(scan.trs.alignment()))
+        scan_from_world = np.linalg.inv(scan.trs.alignment().cam_from_model)
+        cam_from_world = _from_matrix(cam_from_scan.cam_from_model @ scan_from_world)
 
         def read_object(number: int, model: Any) -> PhotoObject | None:
             found: _Model = convert(model, _Model)
@@ -180,7 +181,7 @@ def _object(
 ) -> PhotoObject | None:
     """Convert an object of the scan to a photo's object; None if its box misses the image."""
     world_from_model = found.trs.alignment()
-    cam_from_model = _compose(cam_from_world, world_from_model)
+    cam_from_model = _from_matrix(cam_from_world.cam_from_model @ world_from_model.cam_from_model)
     center, half = np.array(found.center), np.array(found.bbox)
     distance = float(np.linalg.norm(cam_from_model.apply(center[None])))
     if distance > _FARTHEST:
@@ -205,7 +206,7 @@ def _object(
     return PhotoObject(
         object_id=object_id,
         category=name_of_synset(found.catid_cad),
-        truth=Truth(cam_from_model=cam_from_model, box=box, metres=1.0),
+        truth=Truth(cam_from_model=cam_from_model, box=box),
         keypoints=keypoints,
         model=CadModel(found.id_cad, mesh, points, bounds),
         symmetry=Symmetry.around(_UP, fold=_FOLDS[found.sym], offset=center),
@@ -242,19 +243,10 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
     return np.concatenate([low, high]) if (low < high).all() else None
 
 
-def _compose(second: Alignment, first: Alignment) -> Alignment:
-    """Compose ``second`` after ``first``; ``second`` must scale all axes equally."""
-    (moved,) = second.apply(first.translation[None])
-    return Alignment(second.rotation @ first.rotation, moved, second.scale * first.scale)
-
-
-def _invert(alignment: Alignment) -> Alignment:
-    scale = alignment.scale
-    if np.ptp(scale) > 1e-9 * scale.max():
-        raise InputError(f"the scan has unequal scales {scale.tolist()}", where="trs.scale")
-    rotation = alignment.rotation.T
-    shift = -rotation @ alignment.translation / scale[0]
-    return Alignment(rotation, shift, 1 / scale)
+def _from_matrix(matrix: FloatArray) -> Alignment:
+    """Split a transform (4, 4); raises InputError if it shears: unequal scales of the scan."""
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    return Alignment(matrix[:3, :3] / scale, matrix[:3, 3], scale)
 
 
 # Frames of ScanNet -----------------------------------------------------------------------------

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from cadalign.render.overlay import draw_overlay, overlay_model
     from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast import RaycastRenderer, cast_geometry
-    from cadalign.render.scene import Frame, Geometry, Renderer, Scene
+    from cadalign.render.scene import Frame, Geometry, Scene
     from cadalign.render.surface import Studio
     from cadalign.render.viewpoints import (
         Angles,
@@ -26,7 +26,6 @@ __all__ = [
     "Geometry",
     "Probe",
     "RaycastRenderer",
-    "Renderer",
     "Scene",
     "Studio",
     "Viewpoint",

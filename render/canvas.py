@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
+from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
@@ -179,17 +180,11 @@ class Canvas:
     ) -> tuple[int, int]:
         """Left and top of a plate in the corner where it covers the fewest pixels."""
         rows, columns = self.image.shape[:2]
-        corners = [
-            (left, top)
-            for top in (gap, rows - height - gap)
-            for left in (gap, columns - width - gap)
-        ]
-
-        def count_covered(corner: tuple[int, int]) -> int:
-            inside = (keep_clear >= corner) & (keep_clear <= np.add(corner, (width, height)))
-            return int(inside.all(axis=1).sum())
-
-        return min(corners, key=count_covered)
+        lefts, tops = (gap, columns - width - gap), (gap, rows - height - gap)
+        corners = np.array([[(left, top)] for top in tops for left in lefts])
+        inside = (keep_clear >= corners) & (keep_clear <= corners + (width, height))
+        ((left, top),) = corners[inside.all(axis=2).sum(axis=1).argmin()].tolist()
+        return left, top
 
     def _whole(self, points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
         """Convert pixels to OpenCV's fixed-point coordinates on the canvas."""
@@ -213,17 +208,10 @@ LinearArray = npt.NDArray[np.float32]
 ByteImage = npt.NDArray[np.uint8]
 
 
-def linear_from_srgb(encoded: LinearArray) -> LinearArray:
-    """Decode sRGB values (0 to 1, any shape) to linear light; float32."""
-    low = encoded / np.float32(12.92)
-    high = ((np.maximum(encoded, 0) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
-    return np.asarray(np.where(encoded <= 0.04045, low, high), dtype=np.float32)
-
-
-_DECODED = linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
+_DECODED: LinearArray = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 # sRGB bytes by the square root of linear light, which resolves dark values about as sRGB does.
 _STEPS = 1 << 14
-_LIMITS = linear_from_srgb((np.arange(255, dtype=np.float32) + np.float32(0.5)) / np.float32(255))
+_LIMITS = srgb_to_linear((np.arange(255) + 0.5) / 255)
 _ENCODED = np.searchsorted(_LIMITS, np.linspace(0, 1, _STEPS + 1) ** 2).astype(np.uint8)
 
 

@@ -18,20 +18,14 @@ import numpy.typing as npt
 from trimesh.geometry import align_vectors
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import RenderError
-from cadalign.geometry.alignment import OPENGL_AXES, OPENGL_FLIP, Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.errors import RenderError, brief
+from cadalign.geometry.alignment import OPENGL_AXES, OPENGL_FLIP
 from cadalign.geometry.mesh import Material
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.render.canvas import ByteImage, LinearArray
-from cadalign.render.posed_scene import Rectangle, pose_scene
-from cadalign.render.raycast import (
-    RaycastRenderer,
-    check_samples,
-    darken_corners,
-    geometry_of,
-)
-from cadalign.render.scene import Frame, Scene, check_image_size
+from cadalign.render.posed_scene import PosedScene, Rectangle
+from cadalign.render.raycast import RaycastRenderer, geometry_of
+from cadalign.render.scene import Geometry, Scene
 from cadalign.render.surface import DARKEST, Studio, linear_colors
 
 # pyrender and PyOpenGL read these when they are imported.
@@ -53,10 +47,11 @@ _LARGEST = 4096  # side [px] of images that OpenGL draws; larger ones are ray ca
 _SIZE_STEP = 64
 
 
-class PyrenderRenderer:
+class PyrenderRenderer(RaycastRenderer):
     """Renderer with OpenGL under EGL; depth, triangle indices and normals are ray cast.
 
-    Models with transparent parts and cameras with lens distortion are ray cast entirely. All
+    Models with transparent parts and cameras with lens distortion are ray cast entirely. OpenGL
+    antialiases with 4 samples for all ``samples`` above 1. All
     renderers of a process share one OpenGL context. A forked process must not use its parent's
     context, so start pools with "spawn". Broken OpenGL libraries may crash the process:
     `make_renderer` tests them in a subprocess first.
@@ -65,11 +60,10 @@ class PyrenderRenderer:
     name = "pyrender"
 
     def __init__(self, *, studio: Studio | None) -> None:
-        self.studio = studio or Studio()
+        super().__init__(studio=studio)
         self._context = shared_context()
         self._context.check_process()
         self._stage = GlStage(self.studio)
-        self._fallback = RaycastRenderer(studio=self.studio)
 
     @property
     def device(self) -> str:
@@ -80,28 +74,16 @@ class PyrenderRenderer:
         # OpenGL objects belong to this process; other processes make their own.
         return partial(PyrenderRenderer, studio=self.studio), ()
 
-    def render(
-        self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
-    ) -> Frame:
-        """Draw a scene; see `RaycastRenderer.render`.
-
-        OpenGL antialiases with 4 samples for all ``samples`` above 1.
-        """
+    def _paint(self, color: ByteImage, posed: PosedScene, samples: int) -> Geometry:
+        camera = posed.camera
         is_bent = camera.is_wide or bool(camera.distortion)
         is_large = max(camera.width, camera.height) > _LARGEST
-        if is_bent or is_large or samples == 1 or not scene.surface.opaque:
-            return self._fallback.render(scene, camera, cam_from_model, samples=samples)
-        check_samples(samples)
-        check_image_size(camera)
-        posed = pose_scene(scene, camera, cam_from_model)
-        geometry = geometry_of(camera, posed)
-        color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-        if posed is not None:
-            block = posed.block.slices
-            self._stage.place(scene, camera, cam_from_model, (posed.block.left, posed.block.top))
-            color[block] = cv2.cvtColor(self._draw(posed.block), cv2.COLOR_mRGBA2RGBA)
-            darken_corners(color, geometry, posed, self.studio)
-        return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
+        if is_bent or is_large or samples == 1 or not posed.scene.surface.opaque:
+            return super()._paint(color, posed, samples)
+        self._stage.place(posed)
+        drawn = cv2.cvtColor(self._draw(posed.block), cv2.COLOR_mRGBA2RGBA)
+        color[posed.block.slices] = drawn
+        return geometry_of(camera, posed)
 
     def _draw(self, block: Rectangle) -> ByteImage:
         """Draw a block of an image, premultiplied, (h, w, 4)."""
@@ -118,15 +100,8 @@ class GlContext:
     """
 
     def __init__(self) -> None:
-        try:
-            self._renderer = pyrender.OffscreenRenderer(64, 64)  # makes its context current
-            name = GL.glGetString(GL.GL_RENDERER)
-        except Exception as error:  # PyOpenGL and ctypes raise errors of many types
-            raise RenderError(
-                f"OpenGL does not start ({type(error).__name__}: {_beginning(error)})",
-                where="pyrender",
-                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
-            ) from None
+        self._renderer = pyrender.OffscreenRenderer(64, 64)  # makes its context current
+        name = GL.glGetString(GL.GL_RENDERER)
         self.device = name.decode(errors="replace") if name else "unknown"
         self._flags = pyrender.RenderFlags.RGBA
         self._lock = threading.Lock()
@@ -158,7 +133,7 @@ class GlContext:
                 color, _ = self._renderer.render(scene, flags=self._flags)
             except Exception as error:  # PyOpenGL raises errors of many types
                 raise RenderError(
-                    f"OpenGL failed to draw ({type(error).__name__}: {_beginning(error)})",
+                    f"OpenGL failed to draw ({type(error).__name__}: {brief(error)})",
                     where="pyrender",
                     fix="use the ray-cast renderer",
                 ) from None
@@ -167,13 +142,8 @@ class GlContext:
 
 @cache
 def shared_context() -> GlContext:
-    """The context of this process; raises RenderError if OpenGL does not start."""
+    """The context of this process."""
     return GlContext()
-
-
-def _beginning(error: Exception) -> str:
-    """Start of a message, on one line; PyOpenGL's have dozens of lines."""
-    return " ".join(str(error).split())[:160] or "no reason given"
 
 
 # Meshes, lights and the camera --------------------------------------------------------------------
@@ -268,10 +238,9 @@ class GlStage:
         self._shown: Scene | None = None
         self._nodes: tuple[Any, ...] = ()
 
-    def place(
-        self, scene: Scene, camera: Camera, cam_from_model: Alignment, corner: tuple[int, int]
-    ) -> None:
-        """Pose a scene's mesh for the block of an image with the top left pixel ``corner``."""
+    def place(self, posed: PosedScene) -> None:
+        """Pose a scene's mesh for its block of the image."""
+        scene, camera, cam_from_model = posed.scene, posed.camera, posed.alignment
         if scene is not self._shown:
             for node in self._nodes:
                 self.scene.remove_node(node)
@@ -287,8 +256,8 @@ class GlStage:
         lens.zfar = float(depth.max()) + slack
         lens.znear = max(float(depth.min()) - slack, _NEAR_SHARE * lens.zfar)
         lens.fx, lens.fy = camera.fx, camera.fy
-        lens.cx = camera.cx + PIXEL_CENTRE - corner[0]
-        lens.cy = camera.cy + PIXEL_CENTRE - corner[1]
+        lens.cx = camera.cx + PIXEL_CENTRE - posed.block.left
+        lens.cy = camera.cy + PIXEL_CENTRE - posed.block.top
 
     def _add_light(self, power: float) -> Any:
         # The shader divides by pi, as for a Lambertian surface.

@@ -322,9 +322,9 @@ def draw_result(
     unseen = ahead & np.array([label not in seen for label in result.ids], dtype=bool)
     row_of = {label: row for row, label in enumerate(result.ids)}
     own = in_camera[[row_of[label] for label in view.ids]]
-    covariances, regions = result.points_cam_covariance, None
-    is_first = number == 0 or result.rig_from_model is not None
-    if result.model is not None and covariances is not None and is_first:
+    regions, is_first = None, number == 0 or result.rig_from_model is not None
+    covariances = result.points_cam_covariance if result.model is not None and is_first else None
+    if covariances is not None:
         turn = alignment.rotation @ result.alignment.rotation.T
         turned = turn @ covariances[ahead] @ turn.T
         projected = camera.projected_covariances(in_camera[ahead], turned)

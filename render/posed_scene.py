@@ -87,7 +87,7 @@ class PosedScene:
         self.camera = camera
         self.block = block
         self._caster = caster
-        self._alignment = cam_from_model
+        self.alignment = cam_from_model
         self._origin, self._model_from_ray = model_rays(cam_from_model)
         first = scene.triangles[:, 0]
         side = np.einsum("mk,mk->m", self._origin - first, scene.face_normals)
@@ -122,7 +122,7 @@ class PosedScene:
     @cached_property
     def diagonal(self) -> float:
         """Diagonal of the stretched model's bounding box [model units]."""
-        return self.scene.stretched_diagonal(self._alignment)
+        return self.scene.stretched_diagonal(self.alignment)
 
     def occlusion_mask(
         self, points_cam: FloatArray, directions: FloatArray, *, reach: float
@@ -134,7 +134,7 @@ class PosedScene:
         """
         columns = self._model_from_ray.T
         return self._caster.occlusion_mask(
-            (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
+            (points_cam - self.alignment.translation) @ columns, directions @ columns, reach=reach
         )
 
     def shade_hits(
@@ -175,7 +175,7 @@ class PosedScene:
         color = surface.color(face, weights)
         view = (-rays).astype(np.float32)
         view /= np.sqrt(np.einsum("nk,nk->n", view, view))[:, None]
-        up = self._alignment.rotation[:, 1]
+        up = self.alignment.rotation[:, 1]
         return np.column_stack([studio.shade(color[:, :3], normal, view, up), color[:, 3]])
 
     def _weights(self, rays: FloatArray, face: FaceArray, depth: FloatArray) -> LinearArray:

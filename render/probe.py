@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import subprocess
 import sys
 from dataclasses import asdict, dataclass
@@ -12,11 +11,12 @@ from importlib import import_module
 
 import numpy as np
 
-from cadalign.errors import CadalignError, RenderError, unknown_name
+from cadalign.errors import RenderError, brief, unknown_name
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.scene import Renderer, Scene
+from cadalign.render.raycast import RaycastRenderer
+from cadalign.render.scene import Scene
 from cadalign.render.surface import Studio
 
 RENDERERS: dict[str, str] = {
@@ -97,16 +97,15 @@ def report(name: str) -> None:
     try:
         result = _try(name)
     except Exception as error:  # the parent process reports any error
-        reason = error.what if isinstance(error, CadalignError) else str(error)
-        result = Probe(name, False, reason or type(error).__name__)
+        result = Probe(name, False, f"{type(error).__name__}: {brief(error)}")
     sys.stdout.write(f"\n{_MARK}{json.dumps(asdict(result))}\n")
     sys.stdout.flush()
 
 
-def load_renderer(name: str, studio: Studio | None) -> Renderer:
+def load_renderer(name: str, studio: Studio | None) -> RaycastRenderer:
     """Make a renderer without a test, which may crash the process."""
     module, _, kind = RENDERERS[name].partition(":")
-    renderer: Renderer = getattr(import_module(module), kind)(studio=studio)
+    renderer: RaycastRenderer = getattr(import_module(module), kind)(studio=studio)
     return renderer
 
 
@@ -123,15 +122,7 @@ def _try(name: str) -> Probe:
     return Probe(name, True, str(getattr(renderer, "device", "processor")))
 
 
-logger = logging.getLogger("cadalign")
-
-AUTO = "auto"
-
-# OpenGL devices that are software on the CPU.
-_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
-
-
-def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer:
+def make_renderer(name: str = "raycast", *, studio: Studio | None = None) -> RaycastRenderer:
     """Make a renderer.
 
     Renderers other than ``raycast`` are first tested in a subprocess, since broken graphics
@@ -141,15 +132,13 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
     ----------
     name : str
         ``raycast`` works everywhere; ``pyrender`` draws the colour with OpenGL; ``open3d`` casts
-        rays with Open3D. ``auto`` is pyrender where it works on a GPU, and raycast elsewhere:
-        OpenGL on the CPU is no faster and antialiases less, and Open3D is no faster either. The
-        choice is logged (logger "cadalign", level info).
+        rays with Open3D.
     studio : Studio, optional
         The lights.
 
     Returns
     -------
-    Renderer
+    RaycastRenderer
 
     Raises
     ------
@@ -163,10 +152,6 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
     >>> make_renderer("raycast").name
     'raycast'
     """
-    if name == AUTO:
-        return load_renderer(best_renderer(), studio)
-    if name not in RENDERERS:
-        raise unknown_name("renderer", name, [AUTO, *RENDERERS])
     if name != "raycast":
         found = probe_renderer(name)
         if not found.works:
@@ -176,16 +161,3 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
                 fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
             )
     return load_renderer(name, studio)
-
-
-def best_renderer() -> str:
-    """Name of the renderer that "auto" selects on this machine."""
-    found = probe_renderer("pyrender")
-    if not found.works:
-        name, reason = "raycast", f"pyrender does not work here: {found.detail}"
-    elif any(name in found.detail.lower() for name in _SOFTWARE):
-        name, reason = "raycast", f"OpenGL runs on the CPU here: {found.detail}"
-    else:
-        name, reason = "pyrender", found.detail
-    logger.info("renderer: %s (%s)", name, reason)
-    return name

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.errors import InputError, RenderError
+from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
@@ -78,10 +78,23 @@ class RaycastRenderer:
         InputError
             If ``samples`` is not from 1 to 256.
         """
-        check_samples(samples)
+        if not 1 <= samples <= _MAX_SAMPLES:
+            raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
         check_image_size(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         posed = pose_scene(scene, camera, cam_from_model, caster=self._caster(scene))
+        if posed is None:
+            geometry = geometry_of(camera, posed)
+        else:
+            geometry = self._paint(color, posed, samples)
+            darken_corners(color, geometry, posed, self.studio)
+        return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
+
+    def _caster(self, scene: Scene) -> RayCaster:
+        return scene.caster
+
+    def _paint(self, color: ByteImage, posed: PosedScene, samples: int) -> Geometry:
+        """Write the colour without ambient occlusion, (h, w, 4); returns the geometry."""
 
         def shade(
             posed: PosedScene, band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
@@ -90,16 +103,11 @@ class RaycastRenderer:
             color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
 
         # Computed now, since several threads use them.
-        _ = scene.surface, scene.corner_normals
-        geometry = geometry_of(camera, posed, shade)
-        if posed is not None:
-            if samples > 1:
-                self._antialias(color, posed, samples)
-            darken_corners(color, geometry, posed, self.studio)
-        return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
-
-    def _caster(self, scene: Scene) -> RayCaster:
-        return scene.caster
+        _ = posed.scene.surface, posed.scene.corner_normals
+        geometry = geometry_of(posed.camera, posed, shade)
+        if samples > 1:
+            self._antialias(color, posed, samples)
+        return geometry
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
         """Cast more rays through pixels that differ from their neighbours."""
@@ -122,17 +130,6 @@ class Open3DRenderer(RaycastRenderer):
 
     name = "open3d"
 
-    def __init__(self, *, studio: Studio | None) -> None:
-        try:
-            import open3d  # noqa: F401
-        except (ImportError, OSError) as error:  # OSError: a system library is missing
-            raise RenderError(
-                f"Open3D cannot be imported ({error})",
-                where="open3d",
-                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
-            ) from None
-        super().__init__(studio=studio)
-
     def _caster(self, scene: Scene) -> RayCaster:
         return scene.open3d_caster
 
@@ -152,12 +149,6 @@ def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Ge
     """
     check_image_size(camera)
     return geometry_of(camera, pose_scene(scene, camera, cam_from_model))
-
-
-def check_samples(samples: int) -> None:
-    """Refuse a number of rays per pixel that is out of range."""
-    if not 1 <= samples <= _MAX_SAMPLES:
-        raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
 
 
 _Shade = Callable[[PosedScene, Rectangle, FloatArray, FaceArray, FloatArray], None]
@@ -228,8 +219,6 @@ _TILE = 4
 _MAX_POINTS = 12_000
 # Distance of the rays' starts from the surface, in diagonals.
 _LIFT = 2e-3
-_SAME_SIDE = 0.85
-_FEW_ALIKE = 6
 _POINTS_AT_ONCE = 1 << 12
 # Evenly spread points of the unit sphere, (16, 8, 3). Each point of a tile takes every 16th, so
 # that it has points of all heights.
@@ -284,11 +273,14 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> LinearArra
 
     begins = range(0, len(inside), _POINTS_AT_ONCE)
     draw_in_threads(look, [slice(begin, begin + _POINTS_AT_ONCE) for begin in begins])
-    smooth, alike = _share_with_neighbours(sky, hit, depth, normal, posed.diagonal)
-    # A groove or bevel narrower than the grid is only hit here and there, and would look dashed.
-    filled = _fill_gaps(smooth, hit & (alike >= _FEW_ALIKE))
+    # The mean over a tile; beside the object it continues the border, which would else be bright.
+    total, count = (
+        cv2.boxFilter(each, -1, (_TILE, _TILE), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for each in (sky, hit.astype(np.float32))
+    )
+    smooth = np.where(count > 0, total / np.maximum(count, 1), np.float32(1))
     size = block.width, block.height
-    return np.asarray(cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _sky_directions(normal: LinearArray, tile: npt.NDArray[np.int64]) -> FloatArray:
@@ -296,45 +288,3 @@ def _sky_directions(normal: LinearArray, tile: npt.NDArray[np.int64]) -> FloatAr
     # Points of the unit sphere around the normal's tip are cosine-weighted directions.
     towards = normal[:, None] + _SPHERE[tile]
     return np.asarray(towards / np.linalg.norm(towards, axis=2, keepdims=True))
-
-
-def _share_with_neighbours(
-    sky: LinearArray,
-    hit: npt.NDArray[np.bool_],
-    depth: LinearArray,
-    normal: LinearArray,
-    diagonal: float,
-) -> tuple[LinearArray, LinearArray]:
-    """Average over those of the 4 x 4 neighbours on the same surface; returns their number too."""
-    rows, columns = hit.shape
-    before, after = _TILE // 2, _TILE - _TILE // 2 - 1
-    pad = ((before, after), (before, after))
-    wide_sky, wide_hit = np.pad(sky, pad), np.pad(hit, pad)
-    wide_depth = np.pad(depth, pad)
-    wide_normal = np.pad(normal, (*pad, (0, 0)))
-    total = np.zeros(hit.shape, dtype=np.float32)
-    weight = np.zeros(hit.shape, dtype=np.float32)
-    for down in range(_TILE):
-        for right in range(_TILE):
-            near = (slice(down, down + rows), slice(right, right + columns))
-            alike = np.einsum("rck,rck->rc", wide_normal[near], normal) > _SAME_SIDE
-            alike &= wide_hit[near]
-            alike &= np.abs(wide_depth[near] - depth) < 0.03 * diagonal
-            total += np.where(alike, wide_sky[near], 0)
-            weight += alike
-    mean = np.where(hit, total / np.maximum(weight, 1), 1)
-    return np.asarray(mean, dtype=np.float32), np.asarray(weight)
-
-
-def _fill_gaps(sky: LinearArray, known: npt.NDArray[np.bool_]) -> LinearArray:
-    """Replace unknown values by the average of known ones within two pixels."""
-    filled = np.where(known, sky, 0).astype(np.float32)
-    weight = known.astype(np.float32)
-    # The second pass fills the object's border, which would otherwise have a bright rim.
-    for _ in range(2):
-        total = cv2.boxFilter(filled, -1, (3, 3), normalize=False)
-        count = cv2.boxFilter(weight, -1, (3, 3), normalize=False)
-        empty = weight == 0
-        filled = np.where(empty, total / np.maximum(count, 1), filled)
-        weight = np.where(empty, count > 0, weight).astype(np.float32)
-    return np.where(weight > 0, filled, sky)

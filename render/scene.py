@@ -1,10 +1,9 @@
-"""Scenes, frames, and the interface of renderers."""
+"""Scenes and frames."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -160,19 +159,6 @@ class Frame(Geometry):
             If the background is neither a colour nor an image of the frame's size.
         """
         return composite(self.color, background)
-
-
-class Renderer(Protocol):
-    """Interface of renderers."""
-
-    @property
-    def name(self) -> str:
-        """The renderer's name on the command line."""
-
-    def render(
-        self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
-    ) -> Frame:
-        """Render one frame; see `RaycastRenderer.render`."""
 
 
 def check_image_size(camera: Camera) -> None:

@@ -179,7 +179,7 @@ def _matches(dataset: KeypointNet) -> list[ByteImage]:
     photo, view = _view_of(dataset["chair", "sample_chair_006"], noise_px=1.0)
     library = Library.from_models(dataset["chair"])
     matches = library.retrieve(view.pixels, view.keypoint_ids, CAMERA, top=3)
-    return [photo, *(draw_match(photo, CAMERA, match) for match in matches)]
+    return [photo, *(draw_match(photo, match) for match in matches)]
 
 
 def categories() -> None:

@@ -60,6 +60,7 @@ def test_the_worked_photo_aligns_as_its_page_says(
     printed = capsys.readouterr().out
     for line in page.partition("```text\n")[2].partition("```")[0].splitlines():
         assert line in printed
+    assert main(["demo", "--files", str(tmp_path)]) == 1  # it replaces no file
 
 
 def test_named_make_targets_exist() -> None:

@@ -171,7 +171,6 @@ class ObservationFit:
             return FitOptions(**given | {"focal_prior": prior})
 
     def _fit_keypoints(self, seen: Observation, options: FitOptions) -> Result:
-        """Fit a stretched model to the keypoints of one image."""
         from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
         from cadalign.estimation.problems import pack_one
 
@@ -184,7 +183,6 @@ class ObservationFit:
             return fit_one(problem, options, *search, seen.labels, seen.image)
 
     def _align(self, seen: Observation, where: str, options: FitOptions) -> Result:
-        """Align a model to all evidence of an observation."""
         from cadalign.estimation.align import align
 
         model, given = self._model(seen, where, options), seen.fit_options

@@ -13,6 +13,7 @@ from array import array
 from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
@@ -47,15 +48,21 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def __init__(self, inputs: Iterable[Path]) -> None:
         self._digest = hashlib.sha256()
-        self._sources: list[tuple[Path, str]] = []  # file and its folder
+        self._sources: list[Path] = []
         self._cells = array("q")
         self._objects: dict[int, list[tuple[str, Any]]] = {}  # of detectors' files
-        self.has_detections = False
-        for path in inputs:
-            for file, kind in _files_of(path):
-                self._add(file, kind)
-                folder = os.path.dirname(os.path.abspath(file))
-                self._sources.append((file, folder))
+        for file, kind in chain.from_iterable(map(_files_of, inputs)):
+            before = len(self._cells)
+            for own, start in self._entries(file, kind):
+                self._cells.extend((len(self._sources), own, start))
+            if len(self._cells) == before:
+                raise DataError("the file holds no observation", where=str(file))
+            self._sources.append(file)
+
+    @property
+    def has_detections(self) -> bool:
+        """True if an input is a detector's file."""
+        return bool(self._objects)
 
     @property
     def fingerprint(self) -> str:
@@ -75,7 +82,7 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def _task(self, row: int, files: dict[int, BinaryIO], opened: ExitStack) -> ObservationTask:
         source, own, start = self._cells[_CELLS * row : _CELLS * (row + 1)]
-        path, folder = self._sources[source]
+        path = self._sources[source]
         name, content = os.fspath(path), cast(Any, None)
         if source in self._objects:
             name, content = self._objects[source][own]
@@ -89,39 +96,30 @@ class ObservationTasks(Sequence[ObservationTask]):
                 content = read_text(path)
             except DataError as error:
                 content = error
-        return ObservationTask(row, name, content, folder)
+        return ObservationTask(row, name, content, os.path.dirname(os.path.abspath(path)))
 
-    def _add(self, path: Path, kind: str | None) -> None:
+    def _entries(self, path: Path, kind: str | None) -> Iterator[tuple[int, int]]:
+        """Yield the index, or the line's number and offset, of each task in a file."""
         if path.suffix.lower() in LINES:
-            self._add_lines(path)
+            place = 0
+            with open_input(path) as file:
+                for own, line in enumerate(file, start=1):
+                    mark = len(BOM_UTF8) if own == 1 and line.startswith(BOM_UTF8) else 0
+                    if line[mark:].strip():  # after a byte order mark
+                        yield own, place + mark
+                    place += len(line)
+                    self._digest.update(line)
             return
         with suppress(DataError):  # reported in the row of the task
             self._digest.update(read_bytes(path))
+        count = 1
         if kind == DETECTOR:
             # Held in memory; unreadable objects come last.
             bad: dict[str, DataError] = {}
             good = read_image_keypoints(path, problems=bad)
             objects = [*((each.source, each) for each in good), *bad.items()]
-            self._objects[len(self._sources)] = objects
-            self._cells.extend(
-                cell for own in range(len(objects)) for cell in (len(self._sources), own, 0)
-            )
-            self.has_detections = True
-        else:
-            self._cells.extend((len(self._sources), 0, 0))
-
-    def _add_lines(self, path: Path) -> None:
-        """Find the offsets of a file's lines; skips empty lines."""
-        place, before = 0, len(self._cells)
-        with open_input(path) as file:
-            for own, line in enumerate(file, start=1):
-                mark = len(BOM_UTF8) if own == 1 and line.startswith(BOM_UTF8) else 0
-                if line[mark:].strip():  # after a byte order mark
-                    self._cells.extend((len(self._sources), own, place + mark))
-                place += len(line)
-                self._digest.update(line)
-        if len(self._cells) == before:
-            raise DataError("the file holds no observation", where=str(path))
+            self._objects[len(self._sources)], count = objects, len(objects)
+        yield from ((own, 0) for own in range(count))
 
 
 def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:

@@ -37,13 +37,12 @@ class Doctor:
         return self._compile() if self.compile else self._check()
 
     def _check(self) -> int:
-        from cadalign.render.probe import REMEDIES, best_renderer
+        from cadalign.render.probe import REMEDIES
 
         with show_status("testing the renderers ..."):
             renderers = probe_renderers()
         for each in renderers:
             answer(f"{each.name:9} {'works' if each.works else 'fails'}: {each.detail}")
-        answer(f"Default renderer: {best_renderer()}")
         for each in renderers:
             if not each.works:
                 answer(f"To enable {each.name}: {REMEDIES[each.name]}")

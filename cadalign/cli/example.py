@@ -9,6 +9,7 @@ import numpy as np
 from cadalign.cli.common import say
 from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.datasets.sample import make_model
+from cadalign.errors import DataError
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import create_folder
 from cadalign.io.images import write_image
@@ -30,8 +31,12 @@ def write_example(folder: Path) -> None:
 
     The files are photo.jpg, chair.obj (a model of another chair), chair.keypoints.json (its
     keypoints by KeypointNet's names), and clicks.json (keypoints in the photo, 1 px of noise).
+    Raises DataError if one of them exists.
     """
     create_folder(folder)
+    for name in ("photo.jpg", "clicks.json", "chair.obj", f"chair{SUFFIX}"):
+        if (folder / name).exists():
+            raise DataError("exists already", where=str(folder / name), fix="give a new folder")
     shape = ShapeModel.pretrained("chair")
     names = dict(zip(shape.ids, shape.names, strict=True))
     scene, places = build_chair(SEEN)

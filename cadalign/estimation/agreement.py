@@ -57,8 +57,9 @@ _BELOW_DEG, _LOW_DEG = -7.0, 0.0  # elevations of cameras below the ground, and 
 class Rule(NamedTuple):
     """A cause of large residuals, how to correct it, and the ``clause`` of its text.
 
-    A view corrected to None is left out. The corrected estimate must gain ``gain`` of -2 log
-    likelihood, and ``price`` for each equation that it lacks; its residuals are at most ``most``.
+    Only the ``view`` of a number is corrected, if given; one corrected to None is left out. The
+    estimate must gain ``gain`` of -2 log likelihood, and ``price`` for each equation that it lacks;
+    its residuals are at most ``most``.
     """
 
     kind: Kind
@@ -69,6 +70,7 @@ class Rule(NamedTuple):
     gain: float = LEAST_GAIN
     price: float = 0.0
     most: float = math.inf  # [sigma]
+    view: int | None = None
 
 
 class Agreement(NamedTuple):
@@ -161,7 +163,10 @@ class DiagnosisCase:
                 model = replace(model, mesh=None) if model.mesh else model
                 model = model if rule is None else rule.undo_model(model)
             if rule is not None:
-                undone = map(rule.undo_view, views)
+                undone = [
+                    rule.undo_view(each) if rule.view in (None, each.number) else each
+                    for each in views
+                ]
                 views = [each for each in undone if each is not None and each.has_evidence]
             views = number_views(views)
             result = self.estimate(model, views, **changes)

@@ -229,9 +229,7 @@ def _scale_size(size: Size, factor: float) -> Size:
     return Size(**scaled, sigma=size.sigma)
 
 
-def _remove_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
-    if view.number != number:
-        return view
+def _remove_rows(view: View, *, rows: list[int]) -> View:
     kept = np.delete(np.arange(len(view.pixels)), rows)
     ids = [view.keypoint_ids[row] for row in kept.tolist()]
     each = {name: getattr(view, name) for name in ("sigma", "scores", "depth")}
@@ -239,20 +237,10 @@ def _remove_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
     return replace(view, points_2d=view.pixels[kept], ids=ids, **some)
 
 
-def _exchange(view: View, *, number: int, rows: list[int]) -> View:
-    if view.number != number:
-        return view
+def _exchange(view: View, *, rows: list[int]) -> View:
     pixels = view.pixels.copy()
     pixels[rows] = pixels[rows[::-1]]
     return replace(view, points_2d=pixels)
-
-
-def _remove_field(view: View, *, number: int, name: str | None) -> View | None:
-    """Remove a field of the view with a number; None removes the view."""
-    if view.number != number:
-        return view
-    nothing: dict[str, Any] = {str(name): None}
-    return None if name is None else replace(view, **nothing)
 
 
 # Rules -------------------------------------------------------------------------------------------
@@ -338,8 +326,7 @@ def _conflicting_pairs(case: DiagnosisCase) -> Iterator[Rule]:
             if apart > _LEAST_DISTANCE:
                 clause = f"keypoints {quote(names[a])} and {quote(names[b])} are one point of the "
                 clause += f"model and lie {apart:.3g} px apart"
-                undo = partial(_remove_rows, number=view.number, rows=(a, b))
-                yield Rule("mistake", clause, undo)
+                yield Rule("mistake", clause, partial(_remove_rows, rows=[a, b]), view=view.number)
 
 
 def _exchanged_pairs(case: DiagnosisCase) -> Iterator[Rule]:
@@ -349,9 +336,9 @@ def _exchanged_pairs(case: DiagnosisCase) -> Iterator[Rule]:
         for row, name in enumerate(shown):
             other = name.replace("left", "right")
             if other != name and other in shown:
-                undo = partial(_exchange, number=view.number, rows=[row, shown.index(other)])
+                undo = partial(_exchange, rows=[row, shown.index(other)])
                 clause = f"keypoints {quote(name)} and {quote(other)} are exchanged"
-                yield Rule("mistake", clause, undo, most=MOST_CORRECTED)
+                yield Rule("mistake", clause, undo, most=MOST_CORRECTED, view=view.number)
 
 
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
@@ -403,10 +390,12 @@ def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     for place in np.argsort(-np.array(given.squares), kind="stable")[:_MOST_VIEWS].tolist():
         view = case.views[place]
         fields = ("up", "depth", "camera_height")
-        pieces = {name: name for name in fields if getattr(view, name) is not None}
-        whole = {("cam_from_rig" if is_rig else "points_2d"): None} if len(case.views) > 1 else {}
-        for name, field in (pieces | whole).items():
-            undo = partial(_remove_field, number=view.number, name=field)
-            yield piece(f"views[{view.number}].{name}", undo_view=undo)
+        for name in fields:
+            if getattr(view, name) is not None:
+                undo = partial(replace, **{name: None})
+                yield piece(f"views[{view.number}].{name}", undo, view=view.number)
+        if len(case.views) > 1:
+            clause = f"views[{view.number}].{'cam_from_rig' if is_rig else 'points_2d'}"
+            yield piece(clause, lambda view: None, view=view.number)
     if case.size is not None:
         yield piece("size", changes={"size": None})

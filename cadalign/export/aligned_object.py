@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -96,26 +95,14 @@ class AlignedObject:
 class Format(NamedTuple):
     """An export format."""
 
+    kind: Literal["glb", "obj", "ply"]
     about: str  # what is written
-    write: Callable[[Path, AlignedObject], object]
-
-
-def _glb(path: Path, exported: AlignedObject) -> None:
-    from cadalign.export.glb import write_glb  # loads trimesh
-
-    write_glb(path, exported)
 
 
 FORMATS: dict[str, Format] = {
-    "glb": Format("textured model, cameras and photos, for viewers", _glb),
-    "obj": Format(
-        "the mesh, with vertex colours",
-        lambda path, exported: write_mesh(path, exported.placed_mesh, kind="obj"),
-    ),
-    "ply": Format(
-        "the mesh, with vertex colours",
-        lambda path, exported: write_mesh(path, exported.placed_mesh, kind="ply"),
-    ),
+    "glb": Format("glb", "textured model, cameras and photos, for viewers"),
+    "obj": Format("obj", "the mesh, with vertex colours"),
+    "ply": Format("ply", "the mesh, with vertex colours"),
 }
 """The formats by file extension."""
 
@@ -165,5 +152,10 @@ def export_object(path: str | os.PathLike[str], exported: AlignedObject) -> Path
     form = format_of(path)
     create_folder(path.parent)
     with protect_inputs([*exported.sources, *(view.image for view in exported.views)]):
-        form.write(path, exported)
+        if form.kind == "glb":
+            from cadalign.export.glb import write_glb  # loads trimesh
+
+            write_glb(path, exported)
+        else:
+            write_mesh(path, exported.placed_mesh, kind=form.kind)
     return path

@@ -162,7 +162,6 @@ def _photo_node(name: str, photo: PlacedPhoto) -> _Node:
 
 
 def _gltf_material(material: Material) -> dict[str, Any]:
-    """Convert a material to glTF."""
     red, green, blue, alpha = material.color
     look: dict[str, Any] = {
         "name": material.name or "surface",

@@ -299,6 +299,7 @@ class Calibration:
         if missing:
             names = ", ".join(f'"{name}"' for name in _FORMS[kind])
             fix = f"give {{{names}}}" + (" as COLMAP does" if kind == "params" else "")
+            fix += ", or width and height alone if the focal length is unknown"
             raise InputError(f"missing {', '.join(missing)}", where="camera", fix=fix)
         given = {name: data[name] for name in _MATRIX_FIELDS if name in data}
         if kind == "matrix":

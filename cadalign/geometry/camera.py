@@ -127,12 +127,9 @@ class Camera(Calibration):
         points = as_points(points_cam, name="points_cam", dimension=3)
         what, which = "{} points lie behind the camera", "with z > 0"
         if self.is_wide:
+            what = "{} points lie outside the lens's field of view"
             limit = np.degrees(largest_angle(self.distortion))
-            what, which = (
-                "{} points lie outside the lens's field of view",
-                f"less than {limit:.4g} degrees ",
-            )
-            which += "off the axis"
+            which = f"less than {limit:.4g} degrees off the axis"
         fix = f"only points {which} have a projection"
         _refuse(~self.sees(points), what, fix, where="points_cam")
         return self.pixels_of_rays(points)

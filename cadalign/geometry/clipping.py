@@ -1,4 +1,4 @@
-"""Intersection of two oriented boxes: clipped edges and volume."""
+"""Volume of the intersection of two oriented boxes."""
 
 from __future__ import annotations
 
@@ -7,46 +7,9 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 
-_PARALLEL = 1e-14  # component across a face, over the edge's length, of a parallel edge
+_PLACES = 96
 _CORNERS = 42  # bound on a polygon's corners after 6 cuts: 10 without rounding
 _NODE = 1.0 / np.sqrt(3.0)
-
-
-@kernel
-def clip_edges(
-    extents: FloatArray, clip: FloatArray, axes: FloatArray, center: FloatArray, ends: FloatArray
-) -> int:
-    """Clip a box's edges to another box; write their ends and return the number of ends.
-
-    The boxes have the side lengths ``extents`` and ``clip``. ``axes`` (columns), ``center`` and
-    ``ends`` (24, 3) of the first box are in the frame of the second.
-    """
-    count = 0
-    start = np.empty(3)
-    step = np.empty(3)
-    for along in range(3):
-        one, other = (along + 1) % 3, (along + 2) % 3
-        for corner in range(4):
-            a = extents[one] * (0.5 if corner % 2 else -0.5)
-            b = extents[other] * (0.5 if corner // 2 else -0.5)
-            enter, leave = 0.0, 1.0
-            for c in range(3):
-                step[c] = axes[c, along] * extents[along]
-                start[c] = center[c] + axes[c, one] * a + axes[c, other] * b - 0.5 * step[c]
-                half = 0.5 * clip[c]
-                if abs(step[c]) <= _PARALLEL * extents[along]:
-                    if abs(start[c]) > half * (1.0 + 1e-12):
-                        leave = -1.0
-                    continue
-                first, last = (-half - start[c]) / step[c], (half - start[c]) / step[c]
-                enter = max(enter, min(first, last))
-                leave = min(leave, max(first, last))
-            if enter <= leave:
-                for c in range(3):
-                    ends[count, c] = start[c] + enter * step[c]
-                    ends[count + 1, c] = start[c] + leave * step[c]
-                count += 2
-    return count
 
 
 @kernel
@@ -56,28 +19,13 @@ def intersection_volume(
     """Compute the volume of the intersection of two boxes.
 
     The boxes have the side lengths ``first`` and ``second``. ``axes`` (columns) and ``center`` of
-    the second are in the frame of the first. Vertices of the intersection are ends of clipped
-    edges. Between the vertices' x coordinates, the area of the section at x is quadratic, so Gauss'
-    rule with two nodes integrates it exactly. Boxes may share faces, edges or corners.
+    the second are in the frame of the first. Vertices of the intersection are corners of the boxes,
+    and points where an edge of one box crosses a face of the other. Between the x coordinates of
+    all these points, the area of the section at x is quadratic, so Gauss' rule with two nodes
+    integrates it exactly. Boxes may share faces, edges or corners.
     """
-    ends = np.empty((24, 3))
-    places = np.empty(48)
-    count = clip_edges(second, first, axes, center, ends)
-    for i in range(count):
-        places[i] = ends[i, 0]
-    back = np.empty((3, 3))
-    origin = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            back[i, j] = axes[j, i]
-            origin[i] -= axes[j, i] * center[j]
-    more = clip_edges(first, second, back, origin, ends)
-    for i in range(more):
-        x = center[0]
-        for j in range(3):
-            x += axes[0, j] * ends[i, j]
-        places[count + i] = x
-    count += more
+    places = np.empty(_PLACES)
+    count = _cut_places(0.5 * first, 0.5 * second, axes, center, places)
     for i in range(1, count):
         x = places[i]
         k = i
@@ -88,13 +36,46 @@ def intersection_volume(
     room = np.empty((2, _CORNERS, 2))
     volume = 0.0
     for i in range(count - 1):
-        half = 0.5 * (places[i + 1] - places[i])
+        low, high = max(places[i], -0.5 * first[0]), min(places[i + 1], 0.5 * first[0])
+        half = 0.5 * (high - low)
         if half > 0.0:
-            middle = 0.5 * (places[i + 1] + places[i])
             for node in (-_NODE, _NODE):
-                x = middle + node * half
+                x = 0.5 * (low + high) + node * half
                 volume += half * _section_area(first, second, axes, center, x, room)
     return volume
+
+
+@kernel
+def _cut_places(
+    first: FloatArray, second: FloatArray, axes: FloatArray, center: FloatArray, places: FloatArray
+) -> int:
+    """Write the x coordinates between which to integrate; returns their number.
+
+    ``first`` and ``second`` are half the side lengths.
+    """
+    count = 0
+    for along in range(3):
+        for corner in range(4):
+            one, other = (along + 1) % 3, (along + 2) % 3
+            a, b = (1.0 if corner % 2 else -1.0), (1.0 if corner // 2 else -1.0)
+            # An edge of the second box, from its middle, with faces of the first.
+            middle = center + axes[:, one] * a * second[one] + axes[:, other] * b * second[other]
+            step = axes[:, along] * second[along]
+            # An edge of the first box along x, with faces of the second.
+            offset = axes[1, along] * (a * first[1] - center[1])
+            offset += axes[2, along] * (b * first[2] - center[2])
+            for sign in (-1.0, 1.0):
+                places[count] = middle[0] + sign * step[0]
+                count += 1
+                for c in range(1, 3):
+                    if step[c] != 0.0:
+                        way = sign * first[c] - middle[c]
+                        places[count] = middle[0] + step[0] * way / step[c]
+                        count += 1
+                if axes[0, along] != 0.0:
+                    places[count] = center[0] + (sign * second[along] - offset) / axes[0, along]
+                    count += 1
+    return count
 
 
 @kernel

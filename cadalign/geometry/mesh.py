@@ -217,19 +217,11 @@ class Mesh:
         """
         import trimesh
 
-        functions: Any = trimesh.triangles
-        triangles, found = self.triangles, []
-        centroid = triangles.mean(axis=1)
-        radius = np.linalg.norm(triangles - centroid[:, None], axis=2).max(axis=1)
-        for point in np.asarray(points, dtype=float):
-            distance = np.linalg.norm(centroid - point, axis=1)
-            near = np.flatnonzero(distance - radius <= distance.min())
-            places = functions.closest_point(triangles[near], np.tile(point, (len(near), 1)))
-            found.append((near, places, np.linalg.norm(places - point, axis=1).argmin()))
-        face_index = np.array([near[best] for near, _, best in found], dtype=np.int64)
-        closest = np.array([places[best] for _, places, best in found])
-        weights = functions.points_to_barycentric(triangles[face_index], closest).clip(0)
-        return face_index, weights / weights.sum(axis=1, keepdims=True)
+        functions: Any = trimesh  # which has no types
+        body = trimesh.Trimesh(self.vertices, self.faces, process=False)
+        places, _, faces = functions.proximity.closest_point_naive(body, points)
+        weights = functions.triangles.points_to_barycentric(self.triangles[faces], places).clip(0)
+        return faces, weights / weights.sum(axis=1, keepdims=True)
 
     def __repr__(self) -> str:
         materials = f", {len(self.materials)} materials" if len(self.materials) > 1 else ""

@@ -151,13 +151,9 @@ def check_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple[f
         raise InputError(what, where="camera.lens", fix=fix)
     counts, fix = _COEFFICIENTS[kind]
     if kind == "perspective" and len(coefficients) in _EXTENDED_COUNTS:
-        if any(coefficients[12:]):
-            what = f"the sensor's tilt, {quote(coefficients[12:])}, is not modelled"
-            fix = "calibrate without cv2.CALIB_TILTED_MODEL"
-            raise InputError(what, where="camera.distortion", fix=fix)
         if any(coefficients[8:]):
-            what = f"the thin prism terms s1 to s4, {quote(coefficients[8:12])}, are not modelled"
-            fix = "calibrate without cv2.CALIB_THIN_PRISM_MODEL"
+            what = f"thin prisms and a tilted sensor, {quote(coefficients[8:])}, are not modelled"
+            fix = "calibrate without cv2.CALIB_THIN_PRISM_MODEL and cv2.CALIB_TILTED_MODEL"
             raise InputError(what, where="camera.distortion", fix=fix)
         coefficients = coefficients[:8]
     if len(coefficients) not in counts or not np.isfinite(coefficients).all():

@@ -112,10 +112,6 @@ class RayCaster:
         face = self._engine.first_faces(*self._rays(origin, directions, start))
         return face, self._distances(origin, directions, face)
 
-    def normals(self, face: FaceArray | npt.NDArray[np.int64]) -> FloatArray:
-        """Unit normals (n, 3) of triangles (n,)."""
-        return self._normals[face]
-
     def hit_mask(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
         """Mask (n,) of rays (n, 3) from one point that hit anything."""
         return self._engine.occlusion_mask(*self._rays(origin, directions), np.inf)

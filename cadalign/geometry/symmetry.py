@@ -23,15 +23,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats, is_whole, read_only
+from cadalign.arrays import FloatArray, as_floats, is_whole, read_only
 from cadalign.errors import InputError, quote, require_kind
 from cadalign.geometry.alignment import OPENGL_AXES, Alignment
 from cadalign.geometry.rotations import angles_between, nearest_rotation, rotation_from_vector
 
-_QUARTERS = [rotation_from_vector(np.pi / 2 * axis).round() for axis in np.eye(3)]
 FACING = np.diag(OPENGL_AXES)
 """Rotation of an upright model, y up, whose z axis points to the camera."""
-LIKE_FACING = tuple(FACING @ quarter for quarter in _QUARTERS)
+LIKE_FACING = tuple(FACING @ rotation_from_vector(np.pi / 2 * axis).round() for axis in np.eye(3))
 """References that break ties between rotations equally far from `FACING`."""
 _MOST_ROTATIONS = 240
 _SAME_DEG = 1.0  # rotations closer than this are the same, given with few digits
@@ -60,7 +59,7 @@ class Equal:
         return np.asarray((points - self.motion[:3, 3]) @ self.motion[:3, :3])
 
 
-# A rotation P and axes (k, 3): all rotations Rot(axis, angle) P. Three axes: any rotation.
+# A rotation P and its axes (k, 3), none or one: all rotations Rot(axis, angle) P.
 _Branch = tuple[FloatArray, FloatArray]
 _NO_AXES = np.empty((0, 3))
 
@@ -74,8 +73,8 @@ class Symmetry:
     Raises
     ------
     InputError
-        If a shape is wrong, a matrix is not a rotation, an axis is zero, or there are more than 240
-        rotations.
+        If a shape is wrong, a matrix is not a rotation, an axis is zero, there are more than 240
+        rotations, or an axis is not parallel to the others, as with a ball.
 
     Examples
     --------
@@ -89,11 +88,10 @@ class Symmetry:
     center: FloatArray
     """Fixed point (3,) of the rotations [model units]."""
     rotations: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
-    """Rotations (g, 3, 3), the identity first. With one axis: representatives, up to rotations
-    about it. With three axes: the identity alone."""
+    """Rotations (g, 3, 3), the identity first. With an axis: representatives, up to rotations
+    about it."""
     axes: FloatArray = field(default_factory=lambda: _NO_AXES)
-    """Unit vectors (k, 3) of axes about which any rotation belongs to the group: none, one, or
-    three for a sphere (any rotation)."""
+    """Unit vectors (k, 3) of axes about which any rotation belongs to the group: none or one."""
 
     def __post_init__(self) -> None:
         center = as_floats(self.center, name="symmetry.center", shape=(3,))
@@ -180,7 +178,7 @@ class Symmetry:
 
     def __str__(self) -> str:
         if len(self.axes):
-            return "sphere" if len(self.axes) == 3 else "circle"
+            return "circle"
         return "none" if self.is_trivial else f"{len(self.rotations)} rotations"
 
     def canonical(
@@ -247,8 +245,6 @@ class Symmetry:
                 yield branch, np.where(same, scale, after)
 
     def _branches(self, scale: FloatArray, tolerance: float) -> list[_Branch]:
-        if len(self.axes) == 3:
-            return _free_branches(scale, tolerance)
         if not len(self.axes) or _is_round(self.axes[0], scale, tolerance):
             return [(rotation, self.axes) for rotation in self.rotations]
         turns = [rotation_from_vector(angle * self.axes[0]) for angle in _ANGLES]
@@ -261,7 +257,6 @@ def check_symmetry(symmetry: object) -> None:
 
 
 def _direction(axis: FloatArray, where: str) -> FloatArray:
-    """The unit vector of an axis (3,)."""
     length = float(np.linalg.norm(axis))
     if not length > 0:
         raise InputError("the axis has no direction", where=where)
@@ -276,7 +271,8 @@ def _generate_group(rotations: list[FloatArray], axes: FloatArray) -> tuple[Floa
     axis = axes[0]
     cosines = np.array([*(axes @ axis), *(axis @ turn @ axis for turn in rotations)])
     if (np.abs(cosines) < 1 - _PARALLEL).any():
-        return identity[None], identity
+        what, fix = "any rotation is a symmetry, as of a ball", "leave out all but one axis"
+        raise InputError(what, where="symmetry.axes", fix=fix)
     if (cosines[len(axes) :] > 0).all():
         return identity[None], axis[None]
     across = np.cross(axis, identity[np.argmin(np.abs(axis))])
@@ -293,8 +289,6 @@ def _nearest(
     with A = tr N - a'N a, B = -a . vee(N - N').
     """
     rotation, axes = branch
-    if len(axes) == 3:
-        return np.asarray(alignment.rotation.T @ references[0])
     if not len(axes):
         return rotation
     axis = axes[0]
@@ -339,16 +333,3 @@ def _is_round(axis: FloatArray, scale: FloatArray, tolerance: float) -> bool:
     across = (float(np.trace(squares)) - along) / 2
     round_ones = across * np.eye(3) + (along - across) * np.outer(axis, axis)
     return bool(np.abs(squares - round_ones).max() <= 2 * tolerance * squares.max())
-
-
-def _free_branches(scale: FloatArray, tolerance: float) -> list[_Branch]:
-    """Rotations that map a stretched sphere to itself."""
-    same: BoolArray = np.abs(scale[:, None] - scale) <= tolerance * scale
-    if same.all():
-        return [(np.eye(3), np.eye(3))]
-    signed = _closure(_QUARTERS)  # permutations of the axes with signs
-    for axis in range(3):
-        first, second = (other for other in range(3) if other != axis)
-        if same[first, second]:
-            return [(each, np.eye(3)[[axis]]) for each in signed]
-    return [(each, _NO_AXES) for each in signed]

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
-import numpy as np
 from msgspec import Meta, Struct
 
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote, unknown_name
@@ -139,8 +138,8 @@ def convert(
     try:
         with suppress(msgspec.ValidationError):  # raised also by NumPy arrays and numbers
             return msgspec.convert(data, kind, dec_hook=read)
-        with suppress(TypeError, RecursionError):
-            data = msgspec.to_builtins(data, enc_hook=_to_builtin)
+        with suppress(AttributeError, TypeError, RecursionError):
+            data = msgspec.to_builtins(data, enc_hook=lambda each: each.tolist())
         return msgspec.convert(data, kind, dec_hook=read)
     except msgspec.ValidationError as error:
         raise _convert_error(error, data, kind, where) from None
@@ -201,19 +200,14 @@ _WORDS = {
 _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
 
 
-def _to_builtin(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise TypeError(type(value))
-
-
 def _convert_error(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:
     """Convert msgspec's error: name the value and its problem, its place, the fix."""
     text, _, path = str(error).removesuffix("`").partition(" - at `$")
     value = data
     for step in _STEP.finditer(path):
         where += step[0] if step["row"] else f".{step['name']}" if where else step["name"]
-        value = _entry(value, step)
+        with suppress(KeyError, IndexError, TypeError, ValueError):  # msgspec names no map's key
+            value = value[int(step["row"]) if step["row"] else step["name"]]
     if isinstance(cause := error.__cause__, InputError):
         where = ".".join(part for part in (where, cause.where) if part)
         return DataError(cause.what, where=where or None, fix=cause.fix)
@@ -234,13 +228,6 @@ def _convert_error(error: msgspec.ValidationError, data: Any, kind: Any, where: 
         allowed = ", ".join(map(repr, _parts_at(kind, path, "values")))
         return DataError(f"{quote(value)} is not one of {allowed}", where=where or None)
     return DataError(f"{quote(value)} is not {_translate_expectation(text)}", where=where or None)
-
-
-def _entry(value: Any, step: re.Match[str]) -> Any:
-    try:
-        return value[int(step["row"])] if step["row"] else value[step["name"]]
-    except (KeyError, IndexError, TypeError, ValueError):  # msgspec does not name a map's key
-        return value
 
 
 def _translate_expectation(text: str) -> str:

@@ -5,10 +5,8 @@ docs/formats/observation.md describes the format.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -239,7 +237,7 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     """
     for name in ("name", "semantic_id"):
         require_unique(read.keypoints, name)
-    camera = _camera(read.camera)
+    camera = Camera.from_dict(read.camera)
     pixels = [each.uv or (None, None) for each in read.keypoints]
     points_2d = np.array(pixels, dtype=float).reshape(-1, 2)  # NaN for None
     is_found = ~missing_pixels(points_2d)
@@ -268,19 +266,6 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     )
 
 
-def _camera(form: Any) -> Camera:
-    """Convert a camera's fields; the result is cached, since many images share a camera."""
-    try:
-        return _camera_of(json.dumps(form))
-    except (TypeError, ValueError, RecursionError):  # of NumPy's arrays
-        return Camera.from_dict(form)
-
-
-@lru_cache(maxsize=64)
-def _camera_of(text: str) -> Camera:
-    return Camera.from_dict(json.loads(text))
-
-
 def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
     """One optional field of all keypoints as a list; None if no keypoint has it."""
     values = [getattr(keypoint, name) for keypoint in keypoints.values()]
@@ -296,10 +281,15 @@ def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
     return values
 
 
-def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
-    """Convert camera, keypoints, photo and evidence of an image to the fields of a file."""
+def write_image_fields(
+    image: ObservedImage, folder: Path | None, *, needs_xyz: bool = True
+) -> dict[str, Any]:
+    """Convert camera, keypoints, photo and evidence of an image to the fields of a file.
+
+    Unless it ``needs_xyz``, they are left out if all are zero.
+    """
     columns = {
-        "xyz": image.points_3d,
+        "xyz": image.points_3d if needs_xyz or image.points_3d.any() else None,
         "uv": image.points_2d,
         "sigma": image.sigma,
         "semantic_id": image.ids,

@@ -50,25 +50,6 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 
 @contextmanager
-def write_folder(path: Path) -> Iterator[Path]:
-    """Write a folder atomically: if the process is killed, the folder is complete or unchanged.
-
-    The block writes to a temporary folder, which replaces ``path`` at the end. An existing folder
-    must be empty.
-    """
-    import tempfile
-
-    with guard_writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # A unique name: two processes must not share the folder.
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            unfinished = Path(folder, "unfinished")
-            unfinished.mkdir()
-            yield unfinished
-            unfinished.replace(path)
-
-
-@contextmanager
 def protect_inputs(inputs: Iterable[Path | None]) -> Iterator[None]:
     """Protect input files: within the block, overwriting them raises DataError.
 

@@ -41,13 +41,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.plots import Plot, color_of
+from cadalign.evaluation.plots import color_of
+from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import (
     as_path,
@@ -62,7 +62,6 @@ from cadalign.report.headline import headline_of
 from cadalign.report.instances import Media, instance_table
 from cadalign.report.runs import (
     all_methods,
-    group_by_spec,
     read_runs,
     settings_of,
     shown_metrics,
@@ -86,8 +85,7 @@ def write_report(
     Parameters
     ----------
     runs : sequence of path-like
-        Folders of runs, finished or not. Several runs are compared: runs of the same kind, or runs
-        over observations with each other and with an evaluation.
+        Folders of runs, finished or not. Several runs are compared; they are of the same kind.
     path : path-like
         The page to write.
 
@@ -121,9 +119,9 @@ def write_report(
         "runs": [_run_dict(run) for run in found],
         "methods": [method_dict(name, k) for k, name in enumerate(all_methods(found))],
         "metrics": [metric.page() for metric in metrics],
-        "headline": headline_of(found).to_dict(),
+        "headline": headline_of(found),
         "tables": None if table is None else table.to_dict(),
-        "plots": [plot.to_dict() for plot in _plots(found)],
+        "plots": [plot.to_dict() for plot in spec_of(found[0]).plots(found)],
         **media.to_dict(),
     }
     write_text(page, render_page(payload))
@@ -150,18 +148,6 @@ def _run_dict(run: Run) -> dict[str, Any]:
         "total": run.total,
         "settings": [list(pair) for pair in settings_of(run)],
     }
-
-
-def _plots(runs: Sequence[Run]) -> list[Plot]:
-    """Plots of all runs; several kinds of runs share the plot of a metric."""
-    found: dict[str, Plot] = {}
-    for spec, places in group_by_spec(runs):
-        for plot in spec.plots([runs[k] for k in places]):
-            traces = [replace(trace, run=places[trace.run]) for trace in plot.traces]
-            known = found.get(plot.id)
-            before = [] if known is None else known.traces
-            found[plot.id] = replace(known or plot, traces=[*before, *traces])
-    return list(found.values())
 
 
 def method_dict(name: str, place: int) -> dict[str, Any]:

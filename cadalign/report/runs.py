@@ -11,7 +11,7 @@ from typing import Any
 from cadalign.errors import InputError
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.registry import BATCHES, Spec, spec_of, spec_of_config
+from cadalign.evaluation.registry import BATCHES, spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import as_path, refuse_nul
@@ -48,28 +48,13 @@ def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
 
 
 def _require_comparable(runs: Sequence[Run]) -> None:
-    """Raise InputError for runs of several kinds, unless they can be joined by instances."""
-    others = [run for run in runs if not spec_of(run).joins]
-    joining = [run for run in runs if spec_of(run).joins]
-    for run in others:
+    """Raise InputError for runs of several kinds."""
+    first = spec_of(runs[0]).kind(runs[0])
+    for run in runs[1:]:
         kind = spec_of(run).kind(run)
-        apart = [each for each in others[:1] if spec_of(each).kind(each) != kind]
-        if not spec_of(run).metrics:
-            apart += joining
-        for other in apart:
-            raise InputError(
-                f"{run.name} is a run of {kind}, {other.name} one of {spec_of(other).kind(other)}",
-                where="runs",
-                fix="write a report for each kind",
-            )
-
-
-def group_by_spec(runs: Sequence[Run]) -> list[tuple[Spec, list[int]]]:
-    """Specifications of runs, each with the indices of its runs."""
-    places: dict[str, list[int]] = {}
-    for place, run in enumerate(runs):
-        places.setdefault(spec_of(run).name, []).append(place)
-    return [(spec_of(runs[own[0]]), own) for own in places.values()]
+        if kind != first:
+            what = f"{run.name} is a run of {kind}, {runs[0].name} one of {first}"
+            raise InputError(what, where="runs", fix="write a report for each kind")
 
 
 def shown_metrics(runs: Sequence[Run]) -> list[Metric]:
@@ -77,7 +62,7 @@ def shown_metrics(runs: Sequence[Run]) -> list[Metric]:
 
     If no fit succeeded, all metrics that are columns of the results.
     """
-    metrics = {metric.key: metric for spec, _ in group_by_spec(runs) for metric in spec.metrics}
+    metrics = {metric.key: metric for metric in spec_of(runs[0]).metrics}
     further = {metric.key: metric for run in runs for metric in run.metrics} if metrics else {}
     columns = [(run.results, name) for run in runs for name in run.results.column_names]
     names = {name for _, name in columns}
@@ -110,8 +95,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def title_of(runs: Sequence[Run]) -> str:
     """Title of the report."""
-    titles = [spec.title_of([runs[k] for k in places]) for spec, places in group_by_spec(runs)]
-    title = " and ".join(dict.fromkeys(titles))
+    title = spec_of(runs[0]).title_of(runs)
     if len(runs) > 1:
         return f"{len(runs)} runs compared: {title}"
     return title[0].upper() + title[1:]
@@ -133,8 +117,7 @@ def summary_of(runs: Sequence[Run]) -> str:
                 f"The run is unfinished: {run.done:,} of {run.total:,} tasks are done, and the "
                 "numbers are of these tasks alone."
             )
-    about = dict.fromkeys(spec.about for spec, _ in group_by_spec(runs))
-    return " ".join([*sentences, *filter(None, about)])
+    return " ".join(filter(None, [*sentences, spec_of(runs[0]).about]))
 
 
 def settings_of(run: Run) -> list[tuple[str, str]]:

@@ -83,8 +83,14 @@ def category_to_rank(shape: ShapeModel, options: RetrievalOptions, table: ModelT
     if any(isinstance(label, str) for label in shape.ids):
         what, fix = "its keypoints have names", "learn it from models with semantic ids"
         raise InputError(what, where="shape", fix=fix)
-    where = "shape" if options.category is None else "category"
-    return require_category(options.category or shape.category, table.categories, where=where)
+    if options.category is not None:
+        return require_category(options.category, table.categories, where="category")
+    try:
+        return require_category(shape.category, table.categories, where="shape")
+    except InputError as error:
+        raise InputError(
+            error.what, where="shape", fix=f"{error.fix}; or give `category`"
+        ) from None
 
 
 def rank_by_shape(

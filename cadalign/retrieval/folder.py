@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cadalign.errors import CadalignError
-from cadalign.geometry.camera import Camera
 from cadalign.io.files import refuse_input, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
 from cadalign.render.canvas import ByteImage
 from cadalign.render.layers import contact_sheet
-from cadalign.render.overlay import photo_of
+from cadalign.render.overlay import draw_result, photo_of
 from cadalign.retrieval.match import Match
 
 logger = logging.getLogger("cadalign")
@@ -37,7 +35,7 @@ def write_retrieval(
     overlays = {}
     for rank, match in enumerate(matches, start=1):
         overlay, observation = _files(folder, rank)
-        drawn = draw_match(photo, query.camera, match)
+        drawn = draw_match(photo, match)
         overlays[f"{rank}. {match.category} {match.model_id}: {score_text(match.score)}"] = drawn
         write_image(overlay, drawn)
         match.observation(query).save(observation)
@@ -51,17 +49,14 @@ def _files(folder: Path, rank: int) -> tuple[Path, Path]:
     return folder / f"overlay_{rank:02d}.png", folder / f"match_{rank:02d}.json"
 
 
-def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
-    """Draw a match over its photo: box, keypoints and, with a mesh, the model."""
-    (seen,) = match.result.views
-    return draw_overlay(
-        image,
-        camera,
-        est_box=match.box,
-        est_frame=_cast(match, camera),
-        observed=seen.points_2d,
-        reprojected=seen.points_2d + seen.residuals,
-    )
+def draw_match(image: ByteImage, match: Match) -> ByteImage:
+    """Draw a match over its photo: box, keypoints and, with a readable mesh, the model."""
+    mesh = None
+    try:
+        mesh = match.mesh()
+    except CadalignError as error:
+        logger.warning("the model is not drawn: %s", error)
+    return draw_result(image, match.result, mesh=mesh)
 
 
 def none_text(matches: Sequence[Match]) -> str | None:
@@ -73,13 +68,3 @@ def none_text(matches: Sequence[Match]) -> str | None:
 def score_text(score: float) -> str:
     """Format a probability in percent."""
     return f"{100 * score:.1f} %" if score >= 0.0005 else "< 0.1 %"
-
-
-def _cast(match: Match, camera: Camera) -> Geometry | None:
-    """Render a match's mesh; None without a mesh or, with a warning, if it is unreadable."""
-    try:
-        mesh = match.mesh()
-        return None if mesh is None else cast_geometry(Scene(mesh), camera, match.alignment)
-    except CadalignError as error:
-        logger.warning("the model is not drawn: %s", error)
-        return None

@@ -12,15 +12,10 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.assemble import KeypointPosterior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import (
-    FittedKeypoints,
-    Posterior,
-    create_unchecked,
-    point_slopes,
-)
+from cadalign.estimation.result_parts import FittedKeypoints, Posterior, create_unchecked
 from cadalign.estimation.uncertainty.residuals import loss_weights
 from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, projection_jacobian
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
@@ -157,8 +152,7 @@ def posterior_of_keypoints(
     information = pixel_information(options.sigma, len(points_3d))
     squares = np.einsum("ni,nij,nj->n", residuals, information, residuals)
     weights = loss_weights(squares, LOSSES[options.loss], options.loss_scale)
-    slopes = camera.projection_slopes(alignment.apply(points_3d))
-    slopes = slopes @ point_slopes(points_3d, alignment)
+    slopes = projection_jacobian(points_3d, camera, alignment)[:, :, :9]
     total = np.einsum("nki,n,nkl,nlj->ij", slopes, weights, information, slopes)
     total[range(6, 9), range(6, 9)] += options.prior_weight
     free, covariance = options.estimated_unknowns, np.zeros((9, 9))

@@ -123,8 +123,6 @@ def check_key(key: object, where: str) -> ModelKey:
 
 
 class _Stored(Document):
-    """Content of a library file."""
-
     keys: list[ModelKey]
     meshes: list[str | None]
     names: dict[str, int]

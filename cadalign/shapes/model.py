@@ -91,7 +91,8 @@ class ShapeModel:
     few_keypoints: FewKeypoints | None = None
     """Decrease of the inflation for few given keypoints, calibrated likewise; None for none."""
     names: tuple[str, ...] = ()
-    """Names of the keypoints, in the order of ``ids``, accepted wherever an id is; may be empty."""
+    """Names of the keypoints, in the order of ``ids``, accepted wherever an id is; may be empty.
+    The part of a keypoint is its name up to the first comma."""
     lines: tuple[tuple[int, int], ...] = ()
     """Rows of keypoints that belong together, such as the ends of a leg, for skeletons."""
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from cadalign.datasets.shapenet import SYNSETS
 from cadalign.errors import DataError, unknown_name
 from cadalign.geometry.mesh import Mesh, join
 from cadalign.io.documents import read_json
-from cadalign.io.files import as_path, dense_json, write_folder
+from cadalign.io.files import as_path, create_folder, dense_json, guard_writing
 from cadalign.io.meshes.files import write_mesh
 
 MAKERS = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}
@@ -74,7 +75,9 @@ def write_sample_dataset(
         raise DataError(what, where=str(target), fix="give a new or an empty folder")
     splits: dict[str, str] = dict.fromkeys(_SPLITS, "")
     annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    with write_folder(target) as data:
+    create_folder(target.parent)
+    with guard_writing(target), TemporaryDirectory(prefix=".", dir=target.parent) as scratch:
+        data = Path(scratch, target.name)
         for name, index in product(names, range(per_category)):
             mesh, entry = make_model(name, index)
             annotations[name].append(entry)
@@ -88,6 +91,7 @@ def write_sample_dataset(
         for place, text in texts.items():
             (data / place).parent.mkdir(exist_ok=True)
             (data / place).write_text(text, encoding="utf-8", newline="\n")
+        data.replace(target)
     return target
 
 

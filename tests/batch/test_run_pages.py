@@ -1,4 +1,4 @@
-"""Pages of runs over many observations: beside each other, beside runs with truth, by model."""
+"""Pages of runs over many observations: beside each other, by model."""
 
 from __future__ import annotations
 
@@ -16,10 +16,6 @@ from support.pages import Opened, embedded_payload, watched
 
 from cadalign import Alignment, Camera, Observation, ShapeModel
 from cadalign.batch import FitRunOptions, ObservationFit, run_many
-from cadalign.datasets import write_sample_dataset
-from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
-from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.images import read_photo, write_image
 from cadalign.render import look_at
 from cadalign.report import write_report
@@ -49,15 +45,12 @@ def fit(out: Path, seen: Iterable[Observation], **options: Any) -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Runs of the same observations, with models and without, and one with truth."""
+    """Runs of the same observations, with models and without."""
     folder = tmp_path_factory.mktemp("runs")
     fit(folder / "plain", observations())
     cauchy = ObservationFit(loss="cauchy")
     fit(folder / "cauchy", observations(models=True), estimate=cauchy)
-    root = write_sample_dataset(folder / "sample", per_category=1, categories=["chair"])
-    options = KeypointNetOptions(root=root, views_per_model=2, render="none")
-    do_run(options, RunFolder(folder / "truth"), workers=0, dask=None)
-    return {name: folder / name for name in ("plain", "cauchy", "truth")}
+    return {name: folder / name for name in ("plain", "cauchy")}
 
 
 @pytest.fixture
@@ -73,21 +66,6 @@ def test_runs_are_joined_by_observation_whatever_the_model(
     instances = embedded_payload(page)["tables"]["instances"]
     assert instances["id"] == [*range(6), *range(6)]
     assert len(set(instances["category"])) == 2
-
-
-def test_a_run_stands_beside_one_with_truth(
-    runs: dict[str, Path], tmp_path: Path, opened: Opened
-) -> None:
-    chosen = [runs["truth"], runs["cauchy"]]
-    path = write_report(chosen, tmp_path / "r.html")
-    payload = embedded_payload(path)
-    keys = [metric["key"] for metric in payload["metrics"]]
-    assert {"rotation_std_deg", "rotation_error_deg"} <= set(keys)
-    assert {row["run"] for row in payload["headline"]["rows"]} == {0, 1}
-    rms = next(plot for plot in payload["plots"] if plot["id"] == "within_rms_px")
-    assert {trace["run"] for trace in rms["traces"]} == {1}
-    page = opened(path.as_uri(), viewport={"width": 1280, "height": 900})
-    expect(page.locator("table.headline").first).to_be_visible()
 
 
 def test_failed_fits_show_their_photos_and_keypoints(tmp_path: Path, opened: Opened) -> None:

@@ -100,10 +100,9 @@ def test_doctor_shows_what_works_and_how_to_enable_the_rest(monkeypatch, capsys)
     good, bad = Probe("raycast", True, "processor"), Probe("pyrender", False, "no OpenGL")
     for probed, code in (([bad, good], 0), ([Probe("raycast", False, "embreex is gone")], 1)):
         monkeypatch.setattr("cadalign.cli.doctor.probe_renderers", lambda found=probed: found)
-        monkeypatch.setattr("cadalign.render.probe.best_renderer", lambda: "raycast")
         assert Doctor().run() == code
         text = capsys.readouterr().out
-    assert "raycast   fails: embreex is gone\nDefault renderer: raycast\n" in text
+    assert "raycast   fails: embreex is gone\n" in text
     assert f"To enable raycast: {REMEDIES['raycast']}\n" in text
     assert "Compiled solvers: " in text
 

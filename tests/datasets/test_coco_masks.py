@@ -64,8 +64,8 @@ def test_a_polygon_may_leave_the_image() -> None:
     ("segmentation", "text"),
     [
         (7, "segmentation: 7 is not a list"),
-        ([[1.0, 2.0]], "segmentation[0]: [1.0, 2.0] is not a polygon of three or more points"),
-        ([[1.0] * 7], "segmentation[0]: expected x, y of each point, got 7 numbers; "),
+        ([[1.0] * 4], "segmentation[0]: expected x, y of three or more points, got 4 numbers; "),
+        ([[1.0] * 7], "segmentation[0]: expected x, y of three or more points, got 7 numbers; "),
         ([[0.0, 0, 1e9, 0, 1e9, 9]], "segmentation[0]: has points far outside the image; "),
         ([[0.0, 0, 1, float("nan"), 3, 4]], "segmentation[0][3]: nan is not a finite number"),
         ([], "segmentation: the mask is empty; "),
@@ -100,10 +100,3 @@ def test_any_text_is_decoded_or_refused(text: str) -> None:
     except CadalignError:
         return
     assert mask.shape == (2, 3)
-
-
-def test_a_polygon_of_two_points_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
-    square = [1.0, 0.0, 3.0, 0.0, 3.0, 2.0, 1.0, 2.0]
-    mask = decode_segmentation([[1, 1, 2, 2], square], width=4, height=2)
-    assert mask.tolist() == decode_segmentation([square], width=4, height=2).tolist()
-    assert "1 of 2 polygons have fewer than three points; ignored" in caplog.text

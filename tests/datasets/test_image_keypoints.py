@@ -126,10 +126,10 @@ AT = "annotations[0].keypoints"
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (3, "3 is not an object or a list; give COCO's keypoint JSON"),
+        (3, "there are no annotations; give COCO's keypoint JSON"),
         (
             {"frames": []},
-            "annotations: missing; give COCO's keypoint JSON, or a detector's; see the page on "
+            "there are no annotations; give COCO's keypoint JSON, or a detector's; see the page on "
             "detectors in cadalign's docs",
         ),
         ([], "there are no keypoints"),

@@ -88,7 +88,6 @@ def test_the_truth_projects_as_the_reference_does(root):
         camera.project(pose.apply(POINTS)) + 1, project_3d(POINTS, VIEW), atol=1e-9
     )
     assert np.linalg.norm(pose.translation) == pytest.approx(6.0)
-    assert chair.truth.metres is None
     np.testing.assert_array_equal(chair.bbox, [10, 20, 50, 60])
 
 

@@ -218,5 +218,5 @@ def test_overlays_of_models_without_meshes_are_refused_before_the_run(
     options = ["--render", "overlay", "--workers", "0", "--out", str(out)]
     assert main(["evaluate", "keypointnet", str(annotated), *options]) == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "--render: no mesh is used, so there is nothing to draw" in said
+    assert "--render: no mesh of the " in said
     assert not (out / "results.parquet").exists()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.accuracy import cramer_rao_bound
 
 from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
@@ -20,9 +19,9 @@ from cadalign.evaluation.instances.instance import (
 )
 from cadalign.evaluation.methods import LIMIT, fit_methods, fit_options
 from cadalign.evaluation.metrics.errors import limit_estimate
-from cadalign.evaluation.simulation import simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.geometry.alignment import Box
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, projection_jacobian
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.metrics import rotation_error
 
@@ -131,6 +130,16 @@ def test_instances_depend_only_on_seed_and_names() -> None:
     together = make_hull_instances(views, noise_px=1.0, min_visible=6, seed=0)
     assert isinstance(together[1], Instance)
     assert np.array_equal(first, together[1].points_2d)
+
+
+def cramer_rao_bound(problem: SimulatedProblem, *, sigma: float) -> FloatArray:
+    """Inverse Fisher information (9, 9) at the truth, ordered as `cadalign.Result.covariance`."""
+    used = np.delete(np.arange(9), 6)  # x has the scale 1
+    jacobian = projection_jacobian(problem.points_3d, problem.camera, problem.alignment)
+    rows = jacobian[:, :, used].reshape(-1, len(used)) / sigma
+    covariance = np.zeros((9, 9))
+    covariance[np.ix_(used, used)] = np.linalg.inv(rows.T @ rows)
+    return covariance
 
 
 @pytest.mark.long

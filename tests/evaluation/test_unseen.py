@@ -268,4 +268,4 @@ class TestCommand:
         names = [plot.id for plot in SPEC.plots([Run.open(finished.path)])]
         assert names == ["within_rotation_error_deg", "within_box_iou_up_to_scale"]
         headline = headline_of([Run.open(finished.path)])
-        assert "limit" in {row.method for row in headline.rows}
+        assert "limit" in {row["method"] for row in headline["rows"]}

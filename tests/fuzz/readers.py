@@ -216,7 +216,7 @@ def _write_annotations(folder: Path) -> Path:
 
 
 def _read_run(path: Path) -> object:
-    return headline_of(read_runs([path.parent])).to_dict()
+    return headline_of(read_runs([path.parent]))
 
 
 FORMATS = {

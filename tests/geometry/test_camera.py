@@ -232,7 +232,7 @@ COLMAP_DATA: dict[str, Any] = {
         (
             {"model": "PINHOLE", "params": []},
             'camera: missing width, height; give {"model", "width", "height", "params"} '
-            "as COLMAP does",
+            "as COLMAP does, or width and height alone if the focal length is unknown",
         ),
         (
             COLMAP_DATA | {"model": "FOV"},
@@ -377,8 +377,8 @@ def test_coefficients_have_the_shapes_of_opencv(count: int, shape: Any, form: An
 @pytest.mark.parametrize(
     ("row", "text"),
     [
-        (13, "camera.distortion: the sensor's tilt, (0.0, 0.01), is not modelled; calibrate with"),
-        (8, "camera.distortion: the thin prism terms s1 to s4, (0.01, 0.0, 0.0, 0.0), are not mo"),
+        (13, "camera.distortion: thin prisms and a tilted sensor, (0.0, 0.0, 0.0, 0.0, 0.0, 0.01"),
+        (8, "camera.distortion: thin prisms and a tilted sensor, (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)"),
     ],
 )
 def test_unsupported_distortion_terms_are_refused_by_name(row: int, text: str) -> None:

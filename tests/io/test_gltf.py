@@ -123,8 +123,13 @@ def test_vertices_that_primitives_share_are_not_repeated(tmp_path: Path) -> None
         ),
         (
             {"nodes": [{"mesh": 7}]},
-            "meshes[7]: does not exist; there are 1 meshes; the file is cut short or damaged; get "
-            "it again",
+            "cannot be read as a GLTF file (IndexError: list index out of range); the file is cut "
+            "short or damaged; get it again",
+        ),
+        (
+            {"nodes": [{"mesh": -1}]},
+            "cannot be read as a GLTF file (IndexError: list index out of range); the file is cut "
+            "short or damaged; get it again",
         ),
         (
             {"accessors": [POSITIONS | {"count": 5}, CORNERS]},

@@ -176,7 +176,10 @@ FEW = replace(NAMED, ids=tuple(range(100, 110)), category="table")
     ("options", "message"),
     [
         ({"shape": "chair.shape"}, "shape: expected a cadalign.ShapeModel, got str"),
-        ({"shape": replace(SHAPE, category="mug")}, "shape: unknown category 'mug'; known are tab"),
+        (
+            {"shape": replace(SHAPE, category="mug")},
+            "shape: unknown category 'mug'; known are table; ",
+        ),
         ({"shape": NAMED}, "shape: its keypoints have names; learn it from models with semantic"),
         ({"shape": FEW}, "ids: the shape model has fewer than 3 of the keypoints; check them, or"),
     ],

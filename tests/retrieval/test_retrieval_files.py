@@ -211,7 +211,7 @@ def test_a_folder_has_the_matches_and_their_pictures(
     matches = case.retrieve(top=4)
     assert json.loads((out / "matches.json").read_text()) == [m.to_dict() for m in matches]
     first = cv2.imread(str(out / written[0]))[..., ::-1]
-    np.testing.assert_array_equal(first, draw_match(case.photo, CAMERA, matches[0]))
+    np.testing.assert_array_equal(first, draw_match(case.photo, matches[0]))
     assert min(cv2.imread(str(out / "matches.png")).shape[:2]) > 2 * 480
 
 

@@ -110,6 +110,7 @@ def test_observations_name_a_category_or_a_file_beside_them(tmp_path):
 def test_runs_depend_on_the_content_of_a_category():
     options = FitRunOptions(estimate=ObservationFit(shape=Path("chair")))
     assert shape_path("chair") in options.files
+    assert options.as_config()["estimate"]["shape"] == "chair"
 
 
 def test_saving_keeps_every_number(tmp_path):

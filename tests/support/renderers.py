@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from cadalign import Mesh
-from cadalign.render import Renderer, make_renderer
+from cadalign.render import RaycastRenderer, make_renderer
 from cadalign.render.probe import probe_renderer
 
 
@@ -20,7 +20,7 @@ def skip_unless_works(name: str) -> None:
         pytest.skip(f"{name} does not work here: {found.detail}")
 
 
-def renderer_or_skip(name: str) -> Renderer:
+def renderer_or_skip(name: str) -> RaycastRenderer:
     """Make a renderer; skips the test if it does not work."""
     skip_unless_works(name)
     return make_renderer(name)

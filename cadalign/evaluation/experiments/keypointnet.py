@@ -64,7 +64,8 @@ class KeypointNetOptions(ViewOptions):
     """Minimum number of visible keypoints per view; random views are drawn until one has them."""
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
     """Methods of `cadalign fit`; optimal-huber, optimal-cauchy (robust losses); ransac-optimal,
-    ransac-ap4p, ransac-aepnp, ransac-aepnp-refined (RANSAC); limit (the Cramer-Rao bound)."""
+    ransac-ap4p, ransac-aepnp, ransac-aepnp-refined (RANSAC); limit (the Cramer-Rao bound); or
+    functions, as module:function."""
     visibility: Literal["auto", "hull"] = "auto"
     """How visible keypoints are found. auto: by casting rays at the mesh, or as with hull for
     models without a mesh. hull: from the convex hull of the keypoints."""
@@ -281,9 +282,10 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     )
     tasks = KeypointTasks(dataset, options)
     drawn = options.render == "overlay"
-    if drawn and (options.visibility == "hull" or not dataset.subset(with_mesh=True).ids()):
+    meshes = set(dataset.subset(with_mesh=True).ids()) if drawn else set()
+    if drawn and (options.visibility == "hull" or meshes.isdisjoint(tasks.keys)):
         raise InputError(
-            "no mesh is used, so there is nothing to draw",
+            f"no mesh of the {len(tasks.keys)} models is used, so there is nothing to draw",
             where="render",
             fix="give ShapeNet's folder (shapenet), leave out visibility hull, or render none",
         )

@@ -92,8 +92,8 @@ class SweepOptions(FunctionOptions):
     _: KW_ONLY
     methods: tuple[str, ...] | None = None
     """Methods of `cadalign fit`; optimal-huber, optimal-cauchy (robust losses); ransac-optimal,
-    ransac-ap4p, ransac-aepnp, ransac-aepnp-refined (RANSAC); limit (the Cramer-Rao bound). The
-    default depends on the sweep."""
+    ransac-ap4p, ransac-aepnp, ransac-aepnp-refined (RANSAC); limit (the Cramer-Rao bound); or
+    functions, as module:function. The default depends on the sweep."""
     values: tuple[float, ...] | None = None
     """Values of the varied quantity, instead of the default ones."""
     runs: int | None = None

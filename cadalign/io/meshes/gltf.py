@@ -90,7 +90,6 @@ class _GltfFile:
         return read_bytes(self.path.parent / unquote(uri))
 
     def _view(self, number: int) -> memoryview:
-        """The bytes of a buffer view."""
         part = _get_part(self.document, "bufferViews", number)
         announced = _get_part(self.document, "buffers", part["buffer"])["byteLength"]
         data = self._buffers[part["buffer"]]
@@ -185,15 +184,6 @@ class _GltfFile:
         return np.asarray(turned * (1, -1) + (0, 1))
 
 
-def _get_part(document: _Part, name: str, number: int) -> _Part:
-    """Return a numbered part of one of the document's lists; raises DataError if missing."""
-    parts = document.get(name, [])
-    if not 0 <= number < len(parts):
-        raise damage_error(f"does not exist; there are {len(parts)} {name}", f"{name}[{number}]")
-    found: _Part = parts[number]
-    return found
-
-
 def _split_chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
     """Split a GLB file into its document and its binary part."""
     found = {b"JSON": b"", b"BIN\0": b""}
@@ -218,6 +208,12 @@ def _check(document: _Part) -> None:
         what = f"the file requires {brief(', '.join(unknown))}, which is not supported"
         fix = "export it without this extension, such as without compressed geometry"
         raise DataError(what, where="extensionsRequired", fix=fix)
+
+
+def _get_part(document: _Part, name: str, number: int) -> _Part:
+    """Return a numbered part of one of the document's lists; negative numbers count nothing."""
+    parts: list[_Part] = document[name]
+    return parts[number if number >= 0 else len(parts)]
 
 
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:

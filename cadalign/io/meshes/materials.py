@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import math
+import os
 import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -82,7 +83,7 @@ def _material(name: str, library: Path, entry: _Entry, textures: Textures) -> Ma
     if words := entry.get("map_kd"):
         # Options, such as "-s 1 1 1", precede the file's name, which may have blanks.
         files = [find_reference(library, " ".join(words[start:])) for start in range(len(words))]
-        file = next((each for each in files if _is_file(each)), files[0])
+        file = next(filter(os.path.isfile, files), files[0])
         texture = textures.read(file, name=file.name, within=library)
         if texture is None:
             red, green, blue, _ = GREY
@@ -146,13 +147,7 @@ def find_reference(path: Path, name: str) -> Path:
     """
     plain = name.replace("\\", "/")
     places = [path.parent / each for each in (name, plain, PurePosixPath(plain).name)]
-    return next(filter(_is_file, places), places[0])
-
-
-def _is_file(path: Path) -> bool:
-    with suppress(OSError, ValueError):
-        return path.is_file()
-    return False
+    return next(filter(os.path.isfile, places), places[0])
 
 
 def vertex_colors(values: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ Turk, "The PLY polygon file format", 1994.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain
@@ -42,8 +42,8 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     corners, before = list[tuple[int, int]](), list[tuple[int, int]]()
     sizes, looks = list[int](), list[int]()
     libraries, numbers, look = list[str](), {"": 0}, 0  # numbers of materials, by name
-    for number, line in _lines(data):
-        key, _, body = line.partition(b" ")
+    for number, line in enumerate(data.replace(b"\t", b" ").splitlines(), start=1):
+        key, _, body = line.strip().partition(b" ")
         words = body.partition(b"#")[0].split()
         try:
             if key == b"v":
@@ -62,15 +62,15 @@ def read_obj(data: bytes, path: Path) -> Mesh:
                 # Negative indices count back from the current line.
                 before.append((len(vertices) + 1, len(coordinates)))
             elif key == b"usemtl":
-                look = numbers.setdefault(_text(body), len(numbers))
+                look = numbers.setdefault(body.decode(errors="replace").strip(), len(numbers))
             elif key == b"mtllib":
-                libraries.append(_text(body))
+                libraries.append(body.decode(errors="replace").strip())
             elif b"\0" in line:
                 raise damage_error(
                     "holds binary data, not the text of an OBJ file", f"line {number}"
                 )
         except (ValueError, IndexError):
-            shown = line[:60].decode("ascii", errors="replace")
+            shown = line.strip()[:60].decode("ascii", errors="replace")
             raise damage_error(f"cannot read {shown!r}", f"line {number}") from None
     if not sizes:
         what = f"the file has {len(vertices)} vertices, but no faces"
@@ -80,15 +80,11 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     named = np.array(corners)
     indices = np.where(named < 0, np.repeat(before, sizes, axis=0) + named, named)
     counts = len(vertices), len(coordinates) - 1
-    is_none = (named == 0) & [False, True]
-    wrong = np.argwhere(((indices < 1) & ~is_none) | (indices > counts))
+    wrong = np.flatnonzero(((indices < (1, 0)) | (indices > counts)).any(axis=1))
     if len(wrong):
-        corner, kind = wrong[0]
-        face = np.repeat(np.arange(len(sizes)), sizes)[corner]
-        what = f"{('vertex', 'texture coordinate')[kind]} {named[corner, kind]}"
-        raise damage_error(
-            f"face {face} (counted from 0) names {what}, but there are {counts[kind]}"
-        )
+        face = np.repeat(np.arange(len(sizes)), sizes)[wrong[0]]
+        what = f"face {face} (counted from 0) names {'/'.join(map(str, named[wrong[0]]))}, but"
+        raise damage_error(f"{what} there are {counts[0]} vertices, {counts[1]} coordinates")
     used, rows_of = np.unique(looks, return_inverse=True)
     names = np.array([*numbers], dtype=object)[used].tolist()
     known = load_materials(path, libraries, [name for name in names if name])
@@ -109,20 +105,6 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     )
 
 
-def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield stripped lines with their numbers; a backslash at the end continues a line.
-
-    Tabs become blanks, so a blank follows the keyword.
-    """
-    number = 0
-    text = (data + b"\n").replace(b"\t", b" ").replace(b"\r\n", b"\n").replace(b"\\\n", b" \v")
-    for line in text.splitlines():
-        number += 1 + line.count(b"\v")
-        line = line.strip()
-        if line:
-            yield number, line
-
-
 @lru_cache(maxsize=2**16)  # several faces share a corner
 def _parse_corner(word: bytes) -> tuple[int, int]:
     """Parse a corner (``v``, ``v/vt``, ``v//vn``, ...) to (vertex, texture coordinate or 0)."""
@@ -131,10 +113,6 @@ def _parse_corner(word: bytes) -> tuple[int, int]:
     if len(values) > 2:
         raise ValueError(f"{word!r} is not a corner")
     return int(vertex), values[0] if values else 0
-
-
-def _text(body: bytes) -> str:
-    return body.decode("utf-8", errors="replace").strip()
 
 
 _HEADER_END = re.compile(rb"^end_header[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
@@ -205,7 +183,6 @@ def read_ply(data: bytes, path: Path) -> Mesh:
 
 
 def _header(text: str) -> tuple[str, list[_Element]]:
-    """Parse the header; returns the format and the elements."""
     form, elements = "", list[_Element]()
     for line in text.splitlines():
         match line.split():

@@ -152,10 +152,7 @@ class ObjectShape:
         """
         if self.learned is None:
             return point.semantic_id
-        ids, names = self.learned.ids, self.learned.names
-        known: dict[KeypointId | None, KeypointId]
-        known = dict(zip((*ids, *names), (*ids, *ids), strict=False))
-        return known.get(point.name, known.get(point.semantic_id))
+        return self.learned.resolve([point.semantic_id], [point.name], where=None)[0]
 
     def knows(self, points: Sequence[ModelKeypoint]) -> BoolArray:
         """Return a mask (n,) of the points that the shape has, each once; their pairs count."""

@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -110,6 +110,7 @@ class ShapeModel:
             raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
+            object.__setattr__(self, "up_axis", str(self.up_axis))
         if self.training is not None and self.training.points_3d.shape[1] != len(ids):
             what = f"{self.training.points_3d.shape[1]} keypoints for {len(ids)} ids"
             raise InputError(what, where="training")
@@ -119,6 +120,10 @@ class ShapeModel:
         if freedom is not None and (not is_number(freedom) or freedom <= 2):
             what = f"{freedom!r} is not a number above 2, nor None"
             raise InputError(what, where="degrees_of_freedom")
+        object.__setattr__(self, "degrees_of_freedom", freedom and float(freedom))
+        object.__setattr__(self, "inflation", float(self.inflation))
+        for name in ("category", "unit"):
+            object.__setattr__(self, name, check_text(getattr(self, name), name))
         names = tuple(check_text(name, f"names[{row}]") for row, name in enumerate(self.names))
         if names and len(check_ids(names, "names")) != len(ids):
             raise InputError(f"{len(names)} for {len(ids)} keypoints", where="names")
@@ -126,19 +131,10 @@ class ShapeModel:
             if len(line) != 2 or not {*line} <= {*range(len(ids))}:
                 what = f"{quote(line)} is not a pair of rows below {len(ids)}"
                 raise InputError(what, where=f"lines[{row}]")
-        checked = {
-            "category": check_text(self.category, "category"),
-            "ids": ids,
-            "components": tuple(self.components),
-            "up_axis": self.up_axis and str(self.up_axis),
-            "unit": check_text(self.unit, "unit"),
-            "inflation": float(self.inflation),
-            "degrees_of_freedom": freedom and float(freedom),
-            "names": names,
-            "lines": tuple((int(start), int(end)) for start, end in self.lines),
-        }
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "lines", tuple((int(one), int(two)) for one, two in self.lines))
+        object.__setattr__(self, "components", tuple(self.components))
         self.resolve(ids)  # refuses a name or id of two keypoints
 
     @classmethod
@@ -360,13 +356,12 @@ class ShapeModel:
 
         Raises InputError for keypoints that the shape lacks; without ``where``, they are None.
         """
-        found = tuple(self._id_of.get(plain_name(each)) for each in names or ())
-        if ids is not None and all(own is None for own in found):
-            found = tuple(self._id_of.get(plain_name(each)) for each in ids)
-        given = ids if names is None else names
-        if given is None:
+        labels: list[Any] = list(names or ())
+        if ids is not None and not any(plain_name(each) in self._id_of for each in labels):
+            labels = [each.item() if isinstance(each, np.generic) else each for each in ids]
+        elif names is None:
             raise InputError("the keypoints have no semantic_id and no name", where=where)
-        labels = [each.item() if isinstance(each, np.generic) else each for each in given]
+        found = tuple(self._id_of.get(plain_name(each)) for each in labels)
         missing = [quote(each) for each, own in zip(labels, found, strict=True) if own is None]
         if missing and where is not None:
             what = f"{self.category} has no keypoint {', '.join(missing[:8])}"

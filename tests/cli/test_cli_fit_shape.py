@@ -236,6 +236,11 @@ def test_a_shape_that_was_replaced_is_not_exported(
             "leave out what it lacks, or give one of [0, 1, 2, 3, 4, 5, 6, 7]",
         ),
         (
+            {"ids": np.array([0, 1, 9, 3, 4, 5]), "names": NAMES[:6]},
+            "keypoints: box has no keypoint 9; "
+            "leave out what it lacks, or give one of [0, 1, 2, 3, 4, 5, 6, 7]",
+        ),
+        (
             {"ids": None, "names": NAMES[:6]},
             "keypoints: box has no keypoint 'a', 'b', 'c', 'd', 'e', 'f'; "
             "leave out what it lacks, or give one of [0, 1, 2, 3, 4, 5, 6, 7]",

@@ -351,10 +351,25 @@ class ShapeModel:
     ) -> tuple[KeypointId | None, ...]:
         """Find the shape's ids of all keypoints of an object.
 
-        An id may be a name. Of ids and names, the names count if the shape has one of them: ids may
-        be a file's own numbers. Case is ignored in names, ``_`` and ``-`` are equal to a space.
+        Parameters
+        ----------
+        ids : (n,) int or str, optional
+            Ids, or names in their place.
+        names : (n,) str, optional
+            Names. If the shape has one of them, they count and not the ids, which may be a file's
+            own numbers. Case is ignored; ``_`` and ``-`` are equal to a space.
+        where : str or None
+            Place that errors name. None: return None for keypoints that the shape lacks.
 
-        Raises InputError for keypoints that the shape lacks; without ``where``, they are None.
+        Raises
+        ------
+        InputError
+            If the shape lacks a keypoint; the message names it.
+
+        Examples
+        --------
+        >>> ShapeModel.pretrained("chair").resolve(names=["seat, front left", "Back, top-left"])
+        (5, 1)
         """
         labels: list[Any] = list(names or ())
         if ids is not None and not any(plain_name(each) in self._id_of for each in labels):

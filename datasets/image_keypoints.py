@@ -17,6 +17,7 @@ from cadalign.geometry.pixels import check_pixels, missing_pixels
 from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.kinds import PHOTO_ENDINGS
 from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.shapes.parts import plain_name
 
 _COCO_DIGITS = 12
 
@@ -284,22 +285,15 @@ def observe_keypoints(
 
 def _match_rows(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
     """The model's row for each of the image's keypoints; None if the model lacks it."""
-    if found.names is not None:
-        rows = {plain_name(name): row for row, name in enumerate(model.names)}
-        return [rows.get(plain_name(name)) for name in found.names]
-    if found.ids is not None:
-        by_id = {number: row for row, number in enumerate(model.ids)}
-        return [by_id.get(number) for number in found.ids]
+    for given, own in ((found.names, model.names), (found.ids, model.ids)):
+        if given is not None:
+            rows = {plain_name(label): row for row, label in enumerate(own)}
+            return [rows.get(plain_name(label)) for label in given]
     if len(found) != len(model):
         what = f"{len(found)} keypoints without names, but the model has {len(model)}"
         fix = "give names, or all of the model's keypoints in its order"
         raise DataError(what, where=found.source, fix=fix)
     return list(range(len(found)))
-
-
-def plain_name(name: str) -> str:
-    """Normalise a keypoint's name for comparison: lower case, spaces for ``_`` and ``-``."""
-    return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
 def first_names(names: Sequence[str]) -> str:

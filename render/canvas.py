@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
-from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
@@ -208,10 +209,16 @@ LinearArray = npt.NDArray[np.float32]
 ByteImage = npt.NDArray[np.uint8]
 
 
-_DECODED: LinearArray = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+def linear_from_srgb(encoded: npt.NDArray[Any]) -> LinearArray:
+    """Decode sRGB values (0 to 1, any shape) to linear light; trimesh's is slow to import."""
+    high = ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4
+    return np.where(encoded <= 0.04045, encoded / 12.92, high).astype(np.float32)
+
+
+_DECODED = linear_from_srgb(np.arange(256) / 255)
 # sRGB bytes by the square root of linear light, which resolves dark values about as sRGB does.
 _STEPS = 1 << 14
-_LIMITS = srgb_to_linear((np.arange(255) + 0.5) / 255)
+_LIMITS = linear_from_srgb((np.arange(255) + 0.5) / 255)
 _ENCODED = np.searchsorted(_LIMITS, np.linspace(0, 1, _STEPS + 1) ** 2).astype(np.uint8)
 
 

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray
 from cadalign.geometry.simplify import number_rows
-from cadalign.render.canvas import LinearArray, linear_from_bytes
+from cadalign.render.canvas import LinearArray, linear_from_bytes, linear_from_srgb
 
 
 class SurfaceColors:
@@ -70,7 +69,7 @@ class SurfaceColors:
 def linear_colors(color: npt.NDArray[Any]) -> LinearArray:
     """Decode sRGB colours with opacity (n, 4), 0 to 1, to linear light; float32."""
     linear = color.astype(np.float32)
-    linear[:, :3] = srgb_to_linear(linear[:, :3])
+    linear[:, :3] = linear_from_srgb(linear[:, :3])
     return linear
 
 

@@ -44,8 +44,7 @@ def learn(
         unit="diagonal",
         **options,
     )
-    row_of = {label: row for row, label in enumerate(model.ids)}
-    chains = [[row_of[int(each)] for each in chain.split("-")] for chain in table["lines"]]
+    chains = [model.rows([int(each) for each in chain.split("-")]) for chain in table["lines"]]
     names = table["names"]
     if {row for row, name in enumerate(names) if name} != set(model.ids):
         raise SystemExit(f"{category}: the names are not those of the keypoints {model.ids}")

@@ -16,7 +16,6 @@ from cadalign.annotate.marks import Pair
 from cadalign.annotate.photos import ObjectMask, segment_box
 from cadalign.annotate.session import Annotation, Session
 from cadalign.errors import InputError, quote
-from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Finite, ForeignDocument, Index, Point2, Point3, Text, convert
 from cadalign.io.images import read_photo
 from cadalign.io.pretrained import pretrained_path
@@ -101,7 +100,7 @@ def take(state: Annotation, *, keypoint: Index, uv: Point2) -> ActionOutcome:
 
 def skip(state: Annotation) -> ActionOutcome | None:
     """Propose another keypoint; if all were skipped, propose them anew."""
-    proposed = state.proposed(state.alignment())
+    proposed = state.next_keypoint(state.alignment())
     if proposed is None:
         state.skipped.clear()
     else:
@@ -135,7 +134,7 @@ def pick(
     if near is None:
         point = model.pick(model.from_display(origin), direction)
         if point is None:
-            return ActionOutcome(message=model.missed)
+            return ActionOutcome(message=model.miss_message)
         near = registry.find(point.xyz)
         near = registry.add(point) if near is None else near
     return place_keypoint(state, keypoint=near, pair=pair)
@@ -174,15 +173,15 @@ def identify(state: Annotation, *, pair: Index, label: Index | Text) -> ActionOu
     keypoint, registry = state.marks.pair(pair).keypoint, state.model.registry
     if keypoint is None or label not in state.model.shape.ids:
         raise InputError(f"{quote(label)} is not a keypoint of the shape", where="label")
-    if state.model.shape.is_named:
-        registry.rename(keypoint, str(label))
+    if isinstance(label, str):
+        registry.rename(keypoint, label)
         return ActionOutcome(pair)
     if label in registry:
         what = f"the model already has a keypoint {label}"
         raise InputError(what, where="label", fix="click on that keypoint")
     point = registry[keypoint]
     own = point.name if point.name != f"point {keypoint}" else f"keypoint {label}"
-    known = registry.add(replace(point, name=own, semantic_id=int(label)))
+    known = registry.add(replace(point, name=own, semantic_id=label))
     state.record(state.marks.exchange_keypoint(pair, known))
     return ActionOutcome(pair)
 
@@ -192,13 +191,8 @@ def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
     camera = state.marks.camera
     low, high = (bound * camera.width for bound in _FOCAL_RANGE)
     if pixels is None:
-        camera = Camera.from_size(
-            camera.width,
-            camera.height,
-            cx=camera.cx,
-            cy=camera.cy,
-            distortion=camera.distortion,
-        )
+        side = float(max(camera.width, camera.height))
+        camera = replace(camera, fx=side, fy=side, focal_known=False)
     elif low <= pixels <= high:
         camera = camera.replace_focal(pixels)
     else:

@@ -18,6 +18,7 @@ from cadalign.datasets.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
 from cadalign.io.files import checksum, hold_lock, read_bytes
+from cadalign.io.pretrained import category_of
 
 logger = logging.getLogger("cadalign")
 
@@ -33,8 +34,7 @@ class SessionOptions:
     image: Path
     """A photo, or a folder of photos."""
     model: Path | None = None
-    """OBJ, PLY, GLB, glTF, STL or OFF file. Without a model, the keypoints of the
-    shape are marked."""
+    """CAD model; without it, the keypoints of the shape are marked."""
     observation: Path | None = None
     """Observation file of a single photo, by default beside the photo. An existing file is
     continued."""
@@ -128,21 +128,22 @@ def refuse_collisions(written: Iterable[Path], read: Iterable[Path]) -> None:
         seen.add(_key(path))
 
 
-def refuse_other_model(named: Path | None, model: Path | None, *, where: Path) -> None:
-    """Raise DataError if a file names another model than the annotated one.
+def refuse_other_source(
+    kind: Literal["model", "shape"], named: Path | None, own: Path | None, *, where: Path
+) -> None:
+    """Raise DataError if a file names another model or shape than the session's ``own``.
 
-    If the named model no longer exists, it counts as renamed, and a warning is logged.
+    If the named one no longer exists, it counts as renamed, and a warning is logged.
     """
-    if named is None or (model is not None and named.resolve() == model.resolve()):
+    if named is None or (own is not None and named.resolve() == own.resolve()):
         return
-    if model is None:
-        fix = f"give the model, too, or {_OTHER_FOLDER}"
-        raise DataError(f"belongs to the model {named.resolve()}", where=str(where), fix=fix)
-    if not named.exists():
-        logger.warning("%s: its model %s no longer exists, %s is used instead", where, named, model)
+    if own is not None and not named.exists():
+        message = "%s: its %s %s no longer exists, %s is used instead"
+        logger.warning(message, where, kind, named, category_of(own) or own)
         return
-    what = f"belongs to the model {named.resolve()}, not {model.resolve()}"
-    raise DataError(what, where=str(where), fix=_OTHER_FOLDER)
+    name, *others = [category_of(each) or each.resolve() for each in (named, own) if each]
+    what = f"belongs to the {kind} {name}" + "".join(f", not {other}" for other in others)
+    raise DataError(what, where=str(where), fix=f"give that {kind}, or {_OTHER_FOLDER}")
 
 
 def refuse_other_photo(named: Path | None, photo: Path, *, where: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,25 +73,20 @@ class KeypointRegistry:
     def has(self, point: ModelKeypoint) -> bool:
         """True if the keypoint with the point's id has the same position."""
         own = None if point.semantic_id is None else self._points.get(point.semantic_id)
-        return own is not None and self.find(point.xyz, among=[own]) is not None
+        return own is not None and math.dist(own.xyz, point.xyz) <= self._tolerance
 
-    def same(self, point: ModelKeypoint) -> int | None:
+    def find_by_name(self, point: ModelKeypoint) -> int | None:
         """Find the id of the keypoint with the point's name, or with its id if it has no name."""
         for number, own in self:
             if own.name == point.name if point.name else number == point.semantic_id:
                 return number
         return None
 
-    def find(
-        self, xyz: Sequence[float], *, among: Iterable[ModelKeypoint] | None = None
-    ) -> int | None:
+    def find(self, xyz: Sequence[float]) -> int | None:
         """Find the id of the nearest keypoint within the tolerance."""
-        points = list(self._points.values() if among is None else among)
-        if not points:
-            return None
-        gaps = np.linalg.norm(np.array([each.xyz for each in points]) - np.array(xyz), axis=1)
-        nearest = int(np.argmin(gaps))
-        return points[nearest].semantic_id if gaps[nearest] <= self._tolerance else None
+        gaps = {number: math.dist(point.xyz, xyz) for number, point in self}
+        nearest = min(gaps, key=gaps.__getitem__, default=None)
+        return nearest if nearest is not None and gaps[nearest] <= self._tolerance else None
 
     def rename(self, semantic_id: int, name: str) -> None:
         """Rename a keypoint; raises InputError if the name is empty, too long or taken."""
@@ -144,31 +140,30 @@ class ObjectShape:
         return () if self.learned is None else self.learned.ids
 
     @property
-    def is_named(self) -> bool:
-        """True if the learned keypoints have names, not numbers."""
-        return bool(self.ids) and isinstance(self.ids[0], str)
-
-    @property
     def has_outline(self) -> bool:
         """True if masks and photos are evidence of the shape: a learned one needs meshes."""
         training = None if self.learned is None else self.learned.training
         return self.learned is None or bool(training and training.rows_with_mesh)
 
-    @property
-    def unit(self) -> str:
-        """Unit of lengths."""
-        return "model units" if self.learned is None else self.learned.unit
-
     def id_of(self, point: ModelKeypoint) -> KeypointId | None:
-        """Return the id of a model's point in the estimate; None if the learned shape lacks it."""
+        """Return the id of a model's point in the estimate; None if the learned shape lacks it.
+
+        The learned shape knows the point by its name, otherwise by its semantic id.
+        """
         if self.learned is None:
             return point.semantic_id
-        label: KeypointId | None = point.name if self.is_named else point.semantic_id
-        return label if label in self.ids else None
+        return self.learned.resolve([point.semantic_id], [point.name], where=None)[0]
 
     def knows(self, points: Sequence[ModelKeypoint]) -> BoolArray:
-        """Return a mask (n,) of the points that the shape has; only their pairs count."""
-        return np.array([self.id_of(point) is not None for point in points], dtype=bool)
+        """Return a mask (n,) of the points that the shape has, each once; their pairs count."""
+        labels = [self.id_of(point) for point in points]
+        firsts = [label not in (None, *labels[:row]) for row, label in enumerate(labels)]
+        return np.array(firsts, dtype=bool)
+
+    def name_of(self, point: ModelKeypoint) -> str:
+        """Return the name of a point that the shape has, as the shape calls it."""
+        names = () if self.learned is None else self.learned.names
+        return names[self.ids.index(self.id_of(point))] if names else point.name
 
 
 def positions_of(points: Iterable[ModelKeypoint]) -> FloatArray:

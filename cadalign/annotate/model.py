@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.files import LastContent, keypoints_file, refuse_other_model
+from cadalign.annotate.files import LastContent, keypoints_file, refuse_other_source
 from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
@@ -35,7 +35,7 @@ _MOST_CREASES = 1500
 _MOST_LINES = 3000
 _CREASE_DEG = 30.0
 _LONGEST = 1 / 24  # line [diagonals]: each line is drawn or hidden as a whole
-_BOX_PIECES = 16
+_BOX_PIECES = 16  # of the longest edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +94,8 @@ def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> Float
     """Project the edges of the stretched model's box, in pieces, to pixels (k, 2, 2)."""
     corners = Box.from_model(bounds, alignment).corners
     ends = corners[np.array(BOX_EDGES)]
-    share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
-    points = (ends[:, 0] * (1 - share) + ends[:, 1] * share).transpose(1, 0, 2)
-    lines = np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
-    return project_lines(lines, camera, Alignment.identity())
+    piece = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max() / _BOX_PIECES
+    return project_lines(split_lines(ends, piece), camera, Alignment.identity())
 
 
 def project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
@@ -140,7 +138,7 @@ def split_lines(lines: FloatArray, piece: float) -> FloatArray:
 class ClickableModel:
     """A mesh that can be clicked on; centre and diagonal are its box's [model units]."""
 
-    missed = "That click missed the model."
+    miss_message = "That click missed the model."
     """Message for a click that picks nothing."""
 
     def __init__(self, mesh: Mesh) -> None:
@@ -211,14 +209,14 @@ class ClickableModel:
 class MarkedModel:
     """A model that can be clicked on, its keypoints and their file, and the objects' shape.
 
-    Without a ``path`` it is the skeleton of a learned shape, and nothing is written.
+    Without ``path`` and ``keypoints_path`` it is the skeleton of a learned shape.
     """
 
-    path: Path | None
     cad: ClickableModel
     registry: KeypointRegistry
     shape: ObjectShape
-    keypoints_path: Path
+    path: Path | None = None
+    keypoints_path: Path | None = None
     content: LastContent = field(default_factory=LastContent)  # of the keypoints file
 
     @property
@@ -250,13 +248,13 @@ class MarkedModel:
 
     def write_keypoints(self, used: frozenset[int]) -> None:
         """Write all keypoints that are in use or from files; raises DataError on failure."""
-        registry = self.registry
-        if self.path is None:
+        registry, path = self.registry, self.keypoints_path
+        if path is None:
             return
-        self.content.refuse_changed(self.keypoints_path)
+        self.content.refuse_changed(path)
         kept = (point for number, point in registry if number in registry.file_ids | used)
-        ModelKeypoints(tuple(kept), self.path).save(self.keypoints_path)
-        self.content.note(self.keypoints_path)
+        ModelKeypoints(tuple(kept), self.path).save(path)
+        self.content.note(path)
 
 
 def open_model(
@@ -277,6 +275,6 @@ def open_model(
         if source == keypoints or source.exists():
             read = ModelKeypoints.load(source)
             if source == own:
-                refuse_other_model(read.model, path, where=own)
+                refuse_other_source("model", read.model, path, where=own)
             registry.merge(read.keypoints)
-    return MarkedModel(path, cad, registry, shape, own, content)
+    return MarkedModel(cad, registry, shape, path, own, content)

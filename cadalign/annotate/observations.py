@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
+from cadalign.annotate.files import LastContent, refuse_other_photo, refuse_other_source
 from cadalign.annotate.keypoints import ObjectShape, positions_of
 from cadalign.annotate.marks import Marks, Pair
 from cadalign.annotate.model import MarkedModel
@@ -27,11 +27,12 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import Document, Point2, convert, name_file, name_part, read_json
+from cadalign.io.documents import Document, Point2, convert, name_file, name_part
 from cadalign.io.evidence import KeypointFields
 from cadalign.io.focal import FocalPrior
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
+from cadalign.io.pretrained import category_of
 
 logger = logging.getLogger("cadalign")
 
@@ -40,10 +41,6 @@ LIKELY_STRETCH = 0.25
 LEAST_JOINT_PAIRS = 3
 """Minimum number of pairs of an alignment with further evidence; fewer need a start."""
 _OTHER_FILE = "give another --observation or --out"
-# Fields of the object, not of one image.
-_OF_THE_OBJECT = (
-    *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
-)
 _OWN_OPTIONS = {"stretch_sigma", "focal_prior", "image"}
 
 
@@ -72,26 +69,25 @@ class ObservationFile:
     _content: LastContent = field(default_factory=LastContent, repr=False)
     _drawn: tuple[ObjectMask, Path] | None = None  # the last mask that was written, and its file
 
-    def read(self, model: MarkedModel, given: Camera | None, *, up_axis: Any = None) -> Marks:
+    def read(self, model: MarkedModel, camera: Camera, *, up_axis: Any = None) -> Marks:
         """Read the marks of an earlier session, and add new points to the model.
 
-        ``given`` is the camera if there is no file. Raises a CadalignError if a file is invalid.
+        The ``camera`` is for a new file. Raises a CadalignError if a file is invalid.
         """
         self._content.note(self.path)
         if not self.path.exists():
-            camera = camera_of(self.photo, given)
             nothing = np.empty((0, 3)), np.empty((0, 2))
             self.stored = Observation(*nothing, camera, up_axis=up_axis or "y")
             return Marks(camera, model)
-        stored = self._load()
+        stored = Observation.load(self.path)
         if stored.others:
             what = f"has {len(stored.views)} views, the annotator only opens files of one photo"
             raise DataError(what, where=str(self.path), fix=_OTHER_FILE)
-        refuse_other_model(stored.model, model.path, where=self.path)
-        if model.can_exchange and stored.shape is not None:
-            own = ObjectShape.open(stored.shape)
-            if own.category not in (None, model.shape.category):
-                model = open_skeleton(own)
+        refuse_other_source("model", stored.model, model.path, where=self.path)
+        if model.can_exchange and category_of(stored.shape) not in (None, model.shape.category):
+            model = open_skeleton(ObjectShape.open(stored.shape))
+        elif model.is_skeleton:
+            refuse_other_source("shape", stored.shape, model.shape.path, where=self.path)
         refuse_other_photo(stored.image, self.photo.path, where=self.path)
         self._warn_of_options(stored, model)
         with name_file(self.path), name_part("unfinished"):
@@ -105,7 +101,9 @@ class ObservationFile:
             photo=bool(stored.fit_options.get("image")),
             start=stored.init,
         )
-        return _add_halves(_add_pairs(marks, stored), unfinished.pairs)
+        by_name = model.registry.fixed or (stored.model is None and stored.shape is not None)
+        marks = _add_pairs(marks, stored, by_name=by_name)
+        return _add_halves(marks, unfinished.pairs, by_name=by_name)
 
     def write(self, observation: Observation) -> None:
         """Write the observation; raises DataError on failure, or if others changed the file.
@@ -158,23 +156,23 @@ class ObservationFile:
         depths = np.array([np.nan if pair.depth is None else pair.depth for pair in pairs])
         has_depths = bool(np.isfinite(depths).any())
         mask_sigma = None if marks.mask is None else marks.mask.sigma
-        mask = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
-        evidence = msgspec.structs.replace(self.stored.evidence, **mask)
+        changes = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
         if not has_depths:  # all keypoints with depths may be deleted
-            evidence = msgspec.structs.replace(evidence, depth_sigma=None)
+            changes["depth_sigma"] = None
         halves = [_half_of(pair, model) for pair in marks.pairs if pair not in pairs]
         return replace(
             self.stored,
-            points_3d=positions_of(points),
+            # Only places on a CAD model are known: a skeleton's are those of the mean shape.
+            points_3d=positions_of(points) * (not model.is_skeleton),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=marks.camera,
             sigma=_fill_missing(pair.sigma for pair in pairs),
             ids=np.array([point.semantic_id for point in points], dtype=np.int64),
-            names=tuple(point.name for point in points),
+            names=tuple(model.shape.name_of(point) for point in points),
             scores=_fill_missing(pair.score for pair in pairs),
             image=self.photo.path,
             depths=depths if has_depths else None,
-            evidence=evidence,
+            evidence=msgspec.structs.replace(self.stored.evidence, **changes),
             model=model.path,
             fit_options=options,
             shape=model.shape.path,
@@ -196,16 +194,6 @@ class ObservationFile:
             write_image(path, np.where(inside, 255, 0).astype(np.uint8))
             self._drawn = marks.mask, path
         return path
-
-    def _load(self) -> Observation:
-        data = read_json(self.path)
-        if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
-            # All pairs were deleted. The view keeps its other fields, the file keeps the rest.
-            of_the_object = {name: data.pop(name) for name in _OF_THE_OBJECT if name in data}
-            with name_file(self.path):
-                data = {"views": [data], **of_the_object}
-                return Observation.from_dict(data, folder=self.path.parent)
-        return Observation.load(self.path)
 
     def _warn_of_options(self, stored: Observation, model: MarkedModel) -> None:
         """Warn of stored options of the fit that the page does not use."""
@@ -236,33 +224,29 @@ def _half_of(pair: Pair, model: MarkedModel) -> dict[str, Any]:
     fields = {name: getattr(pair, name) for name in ("uv", "sigma", "score", "depth")}
     if pair.keypoint is not None:
         point = model.registry[pair.keypoint]
-        fields |= {"semantic_id": pair.keypoint, "xyz": point.xyz, "name": point.name}
+        xyz = None if model.is_skeleton else point.xyz
+        fields |= {"semantic_id": pair.keypoint, "xyz": xyz, "name": point.name}
     return {name: value for name, value in fields.items() if value is not None}
 
 
-def _add_halves(marks: Marks, halves: Sequence[_Half]) -> Marks:
+def _add_halves(marks: Marks, halves: Sequence[_Half], *, by_name: bool) -> Marks:
     """Add unfinished pairs to the marks, except pairs of which no half is left."""
-    registry = marks.model.registry
     for half in halves:
-        keypoint = half.semantic_id
-        if half.xyz is not None or registry.fixed:
-            point = ModelKeypoint(half.name or "", half.xyz or (0, 0, 0), keypoint)
-            keypoint = _register(point, marks)
-        elif keypoint not in registry or keypoint in marks.keypoints:
-            keypoint = None
+        point = ModelKeypoint(half.name or "", half.xyz or (0, 0, 0), half.semantic_id)
+        keypoint = _register(point, marks, by_name=by_name or half.xyz is None)
         if half.uv is not None or keypoint is not None:
             pair = Pair(marks.next_number, half.uv, keypoint, half.sigma, half.score, half.depth)
             marks = marks.append(pair)
     return marks
 
 
-def _add_pairs(marks: Marks, observation: Observation) -> Marks:
+def _add_pairs(marks: Marks, observation: Observation, *, by_name: bool) -> Marks:
     ids, names = observation.ids, observation.names
     columns = (observation.sigma, observation.scores, observation.depths)
     for row, (x, y, z) in enumerate(observation.points_3d.tolist()):
         number = None if ids is None else int(ids[row])
         point = ModelKeypoint("" if names is None else names[row], (x, y, z), number)
-        keypoint = _register(point, marks)
+        keypoint = _register(point, marks, by_name=by_name)
         known = [None if each is None else float(each[row]) for each in columns]
         known = [None if each is None or math.isnan(each) else each for each in known]
         u, v = observation.points_2d[row].tolist()
@@ -270,14 +254,15 @@ def _add_pairs(marks: Marks, observation: Observation) -> Marks:
     return marks
 
 
-def _register(point: ModelKeypoint, marks: Marks) -> int | None:
+def _register(point: ModelKeypoint, marks: Marks, *, by_name: bool) -> int | None:
     """Find a free point of an observation file in the registry, or add it; returns its id.
 
-    Returns None if the registry is fixed and has no such point.
+    A point of a learned shape, whose ``xyz`` is not on the model, is found ``by_name`` or not at
+    all; the result is then None.
     """
     wanted, registry, taken = point.semantic_id, marks.model.registry, marks.keypoints
-    if registry.fixed:
-        known = registry.same(point)
+    if by_name:
+        known = registry.find_by_name(point)
         return None if known in taken else known
     if wanted is not None and wanted not in taken and registry.has(point):
         return wanted

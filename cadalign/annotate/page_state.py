@@ -75,7 +75,7 @@ def page_state(
             "model": {
                 "key": state.model.shape.category or "",
                 "is_skeleton": state.model.is_skeleton,
-                "proposed": state.proposed(live),
+                "proposed": state.next_keypoint(live),
                 "categories": CATEGORIES if state.model.can_exchange else (),
             },
             "alignment": _alignment(state, live, is_ready=session.ready),
@@ -268,12 +268,13 @@ def _extent(
 
 def _distance(result: Result, shape: ObjectShape) -> tuple[str, str]:
     covariance, distance = result.covariance, float(np.linalg.norm(result.alignment.translation))
+    unit = "model units" if shape.learned is None else shape.learned.unit
     if covariance is None or not distance > 0:
-        return f"{distance:.3g}", shape.unit
+        return f"{distance:.3g}", unit
     relative = distance_deviation(result.alignment, covariance)
     if relative > NOT_DETERMINED:
         return _UNDETERMINED
-    return f"{distance:.3g} ± {short(relative * distance)}", shape.unit
+    return f"{distance:.3g} ± {short(relative * distance)}", unit
 
 
 def _focal(result: Result, *, is_assumed: bool) -> tuple[str, str]:

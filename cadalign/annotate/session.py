@@ -103,7 +103,7 @@ class Annotation:
         """Set the current marks."""
         self.history.record(marks)
 
-    def proposed(self, live: LiveAlignment) -> int | None:
+    def next_keypoint(self, live: LiveAlignment) -> int | None:
         """The keypoint of a skeleton to mark next; None for a model, or if there is none."""
         if not self.model.is_skeleton:
             return None
@@ -123,12 +123,9 @@ class Annotation:
     def exchange_shape(self, shape: ObjectShape) -> None:
         """Mark the keypoints of another shape; pairs of equal names stay, others lose theirs."""
         model, marks, before = open_skeleton(shape), self.marks, self.model.registry
-        changed = [
-            each
-            if each.keypoint is None
-            else replace(each, keypoint=model.registry.same(before[each.keypoint]))
-            for each in marks.pairs
-        ]
+        found: dict[int | None, int | None]
+        found = {number: model.registry.find_by_name(before[number]) for number in marks.keypoints}
+        changed = [replace(each, keypoint=found.get(each.keypoint)) for each in marks.pairs]
         kept = [each for each in changed if each.uv is not None or each.keypoint is not None]
         self.record(replace(marks, model=model, pairs=tuple(kept), start=None))
 
@@ -186,6 +183,7 @@ class Session:
     """All state of an annotator; safe to use from several threads."""
 
     model: MarkedModel
+    """CAD model of all photos; without one, the skeleton of new photos."""
     photos: list[Annotation] = field(default_factory=list)
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,17 +18,12 @@ from cadalign.shapes.model import ShapeModel
 
 _BAR, _JOINT = 0.006, 0.011  # radii [diagonals]
 _COLOR = (0.05, 0.09, 0.16, 1.0)
-_OCTAHEDRON = np.array([[x, y, z] for x in (0, 1) for y in (2, 3) for z in (4, 5)], dtype=np.int64)
-_PRISM = np.array(
-    [[k, (k + 1) % 6, 6 + k] for k in range(6)]
-    + [[6 + k, 6 + (k + 1) % 6, (k + 1) % 6] for k in range(6)]
-)
 
 
 class Skeleton(ClickableModel):
     """The mean keypoints of a learned shape with bars between them; only keypoints are clicked."""
 
-    missed = "Click on one of the keypoints, the white points."
+    miss_message = "Click on one of the keypoints, the white points."
 
     def __init__(self, shape: ShapeModel) -> None:
         points = shape.mean[: len(shape.ids)]
@@ -51,7 +46,7 @@ def open_skeleton(shape: ObjectShape) -> MarkedModel:
     registry = KeypointRegistry(fixed=True)
     for point in ModelKeypoints.from_shape(learned).keypoints:
         registry.add(point)
-    return MarkedModel(None, Skeleton(learned), registry, shape, Path())
+    return MarkedModel(Skeleton(learned), registry, shape)
 
 
 def next_row(
@@ -79,24 +74,13 @@ def next_row(
 
 
 def _mesh(points: FloatArray, lines: FloatArray, name: str) -> Mesh:
-    """Make an octahedron at each point (m, 3), and a bar along each line (k, 2, 3)."""
+    """Make a ball at each point (m, 3), and a bar along each line (k, 2, 3)."""
+    import trimesh  # takes time
+
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    corners = np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]
-    parts = [(point + _JOINT * size * corners, _OCTAHEDRON) for point in points]
-    turns = np.linspace(0, 2 * np.pi, 6, endpoint=False)[:, None]
-    for start, end in lines:
-        along = end - start
-        side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
-        if not side.any():  # the keypoints coincide
-            continue
-        side /= np.linalg.norm(side)
-        other = np.cross(along, side) / np.linalg.norm(along)
-        ring = _BAR * size * (np.cos(turns) * side + np.sin(turns) * other)
-        parts.append((np.concatenate([start + ring, end + ring]), _PRISM))
-    firsts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    return Mesh(
-        np.concatenate([vertices for vertices, _ in parts]),
-        np.concatenate([first + faces for first, (_, faces) in zip(firsts, parts, strict=False)]),
-        materials=(Material(color=_COLOR),),
-        source=name,
-    )
+    balls = [trimesh.creation.icosphere(subdivisions=0, radius=_JOINT * size) for _ in points]
+    for ball, point in zip(balls, points, strict=True):
+        ball.apply_translation(point)
+    bars = [trimesh.creation.cylinder(_BAR * size, segment=line, sections=6) for line in lines]
+    whole: Any = trimesh.util.concatenate([*balls, *bars])
+    return Mesh(whole.vertices, whole.faces, materials=(Material(color=_COLOR),), source=name)

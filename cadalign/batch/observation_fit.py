@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.view import View
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
-    from cadalign.shapes.parts import KeypointId
 
 _NOT_OF_FIT = ("shape_sigma", "image")  # stored options that `FitOptions` lacks
 _STORED = ("sigma", "method", "loss", "stretch", "shape_sigma", "focal")
@@ -287,7 +286,7 @@ def views_of(
     """Build the views of an observation for `cadalign.align`.
 
     The standard deviation is a stated ``sigma`` [px], otherwise the image's own, otherwise 1. The
-    keypoints of a learned shape are found by semantic id or name. With ``with_photos``, the photos
+    keypoints of a learned shape are found by `ShapeModel.resolve`. With ``with_photos``, the photos
     themselves are evidence.
 
     Raises InputError if the shape lacks a keypoint, the observation has no ids or names, an id
@@ -300,7 +299,9 @@ def views_of(
     views = []
     for number, image in enumerate(observation.views):
         with name_part(f"views[{number}]") if observation.others else nullcontext():
-            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else labels[number]
+            ids = labels[number]
+            if isinstance(model, ShapeModel) and len(image.points_2d):
+                ids = model.resolve(image.ids, image.names, where="keypoints")
             evidence = image.evidence.given
             if image.depths is not None:
                 evidence["depth"] = image.depths
@@ -316,29 +317,6 @@ def views_of(
             )
             views.append(view)
     return tuple(views)
-
-
-def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
-    """Return the shape's ids of an image's keypoints, by their names if the shape has some of them.
-
-    `views_of` describes the errors.
-    """
-    if not len(image.points_2d):
-        return ()
-    of_shape = shape.names or (shape.ids if isinstance(shape.ids[0], str) else ())
-    by_name = image.names is not None and (image.ids is None or bool({*image.names} & {*of_shape}))
-    field = "name" if of_shape and (by_name or of_shape is shape.ids) else "semantic_id"
-    given = image.names if field == "name" else image.ids
-    if given is None:
-        kinds = "names" if of_shape is shape.ids else "semantic ids"
-        kinds += " or names" if shape.names else ""
-        raise InputError(
-            f"the keypoints have no {field}",
-            where="keypoints",
-            fix=f"the shape of {shape.category} identifies its keypoints by their {kinds}",
-        )
-    rows = shape.rows(given, where=f"keypoints.{field}")
-    return tuple(shape.ids[row] for row in rows)
 
 
 def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:

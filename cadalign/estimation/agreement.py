@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -372,7 +372,7 @@ def _wrong_keypoints(
     return (text, None, ()) if all_agree or len(wrong) > 1 else (text, *next(iter(wrong.items())))
 
 
-def shape_names(model: AnyModel, labels: Iterable[Any]) -> list[str]:
+def shape_names(model: AnyModel, labels: Collection[Any]) -> list[str]:
     """Names of a learned shape's keypoints; empty for other models, and without names."""
     if isinstance(model, Model) or not model.names:
         return []

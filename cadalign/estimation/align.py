@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -156,15 +156,13 @@ def align(
 
 
 def _resolve_names(model: object, views: list[View]) -> list[View]:
-    """Replace names of keypoints by the ids of a learned shape that has both."""
-    if not isinstance(model, ShapeModel) or not model.names:
+    """Replace names of keypoints by the ids of a learned shape."""
+    if not isinstance(model, ShapeModel):
         return views
-    own: dict[Hashable, Hashable] = dict(zip(model.names, model.ids, strict=True))
+    ids = [model.resolve(each.keypoint_ids, where=f"views[{each.number}].ids") for each in views]
     return [
-        replace(view, ids=tuple(own.get(label, label) for label in view.keypoint_ids))
-        if any(label in own for label in view.keypoint_ids)
-        else view
-        for view in views
+        view if own == view.keypoint_ids else replace(view, ids=own)
+        for view, own in zip(views, ids, strict=True)
     ]
 
 

@@ -275,7 +275,7 @@ def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     model, fails = case.model, not case.has_chance(given)
     yield from _mistakes_in(case)
     yield from _conflicting_pairs(case)
-    yield from _exchanged_pairs(case)
+    yield from _exchanged_pairs(case, given)
     yield from _other_sizes(case) if case.is_exact or fails else ()
     if case.is_plain and isinstance(model, Model) and fails:
         if model.stretch is not None or model.stretch_sigma is not None:
@@ -329,16 +329,16 @@ def _conflicting_pairs(case: DiagnosisCase) -> Iterator[Rule]:
                 yield Rule("mistake", clause, partial(_remove_rows, rows=[a, b]), view=view.number)
 
 
-def _exchanged_pairs(case: DiagnosisCase) -> Iterator[Rule]:
-    """Rules for a left and a right keypoint of a learned shape that are exchanged."""
-    for view in case.views:
-        shown = shape_names(case.model, view.keypoint_ids)
-        for row, name in enumerate(shown):
-            other = name.replace("left", "right")
-            if other != name and other in shown:
-                undo = partial(_exchange, rows=[row, shown.index(other)])
-                clause = f"keypoints {quote(name)} and {quote(other)} are exchanged"
-                yield Rule("mistake", clause, undo, most=MOST_CORRECTED, view=view.number)
+def _exchanged_pairs(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
+    """Rules for an exchanged left and right keypoint of a learned shape, in the worst view."""
+    view = case.views[int(np.argmax(given.squares))]
+    shown = shape_names(case.model, view.keypoint_ids)
+    for row, name in enumerate(shown):
+        other = name.replace("left", "right")
+        if other != name and other in shown:
+            undo = partial(_exchange, rows=[row, shown.index(other)])
+            clause = f"keypoints {quote(name)} and {quote(other)} are exchanged"
+            yield Rule("mistake", clause, undo, most=MOST_CORRECTED, view=view.number)
 
 
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:

@@ -33,8 +33,8 @@ _FOCAL_GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0
 class ShapePrior:
     """Gaussian components of a shape, and priors on its scales.
 
-    Rows are the keypoints ``ids`` (m,), with optional ``names``, then the box's minimum and maximum
-    corner. Fields with defaults are from `cadalign.ShapeModel`.
+    Rows are the keypoints ``ids`` (m,), then the box's minimum and maximum corner. Fields with
+    defaults are from `cadalign.ShapeModel`.
     """
 
     ids: tuple[Hashable, ...]
@@ -47,7 +47,6 @@ class ShapePrior:
     has_box: bool = True
     box_margins: BoxMargins | None = None
     few_keypoints: FewKeypoints | None = None
-    names: tuple[str, ...] = ()
 
     @property
     def lengths(self) -> FloatArray:
@@ -61,9 +60,8 @@ class ShapePrior:
         missing = [name for name in ids if name not in place]
         if missing:
             listed = ", ".join(quote(name) for name in missing[:5])
-            known = self.names or self.ids
-            names = ", ".join(quote(name) for name in known[:12])
-            more = ", ..." if len(known) > 12 else ""
+            names = ", ".join(quote(name) for name in self.ids[:12])
+            more = ", ..." if len(self.ids) > 12 else ""
             fix = f"the model has {names}{more}" if names else "give the model points_3d="
             raise InputError(f"the model has no keypoint {listed}", where=where, fix=fix)
         return [place[name] for name in ids]
@@ -105,7 +103,7 @@ def _category_prior(model: ShapeModel) -> ShapePrior:
     weights = tuple(component.weight for component in model.components)
     up = axis_vector(model.up_axis)
     held = ScalePriors(np.zeros(3), np.zeros((3, 3)), _NO_BOUND)
-    names = "inflation", "degrees_of_freedom", "has_box", "box_margins", "few_keypoints", "names"
+    names = "inflation", "degrees_of_freedom", "has_box", "box_margins", "few_keypoints"
     own: dict[str, Any] = {name: getattr(model, name) for name in names}
     return ShapePrior(model.ids, shapes, weights, held, up, **own)
 

@@ -18,6 +18,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, cast
 import tyro
 
 from cadalign.errors import InputError, unknown_name
+from cadalign.io.pretrained import category_of
 
 T = TypeVar("T")
 Function = str | Callable[..., Any]
@@ -107,7 +108,11 @@ def _unwrap_partial(function: Any) -> Any:
 
 
 def plain_value(value: Any) -> Any:
-    """Convert a value for JSON: absolute normalised paths, functions by their import paths."""
+    """Convert a value for JSON.
+
+    Paths are absolute and normalised, shapes that come with the package are named by their
+    category, and functions by their import paths.
+    """
     if is_dataclass(value):
         return {each.name: plain_value(getattr(value, each.name)) for each in fields(value)}
     if callable(value):
@@ -118,7 +123,9 @@ def plain_value(value: Any) -> Any:
         return [plain_value(each) for each in value]
     if hasattr(value, "tolist"):  # an array
         return value.tolist()
-    return os.path.abspath(value) if isinstance(value, Path) else value
+    if isinstance(value, Path):
+        return category_of(value) or os.path.abspath(value)
+    return value
 
 
 @dataclass(frozen=True, kw_only=True)

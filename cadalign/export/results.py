@@ -12,6 +12,7 @@ import numpy.typing as npt
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.geometry.alignment import (
+    BOX_FACES,
     NOT_DETERMINED,
     NOT_DETERMINED_ROTATION_DEG,
     bounds_corners,
@@ -46,6 +47,8 @@ def result_text(result: Any) -> str:
         translation += f" +- ({deviations})" if is_known else " (not determined)"
         stretch = [f"{text}{deviation_text(std.scale[k])}" for k, text in enumerate(stretch)]
         known_to = deviation_text(std.focal)
+    if unit := getattr(result.model, "unit", ""):  # a learned shape's
+        translation += f" [{unit}]"
     lines = [
         f"{result.method}: {some} keypoints{views}, rms {result.rms:.3g} px",
         f"  rotation     {rotation}",
@@ -190,15 +193,12 @@ def object_of(
     if len(paths) != len(result.views):
         what = f"{len(paths)}, but the result has {len(result.views)} views"
         raise InputError(what, where="photos", fix="give one or None for each")
-    from scipy.spatial import ConvexHull
-
     from cadalign.render.overlay import drawable_mesh  # takes time to import
     from cadalign.shapes.model import ShapeModel
 
     known = drawable_mesh(result, mesh)
     if known is None and isinstance(result.model, ShapeModel) and not result.model.training:
-        corners = bounds_corners(*result.bounds)
-        known = Mesh(corners, ConvexHull(corners).simplices)
+        known = Mesh(bounds_corners(*result.bounds), np.array(BOX_FACES))
     if known is None:
         what = "there is no mesh of the model to write"
         raise InputError(what, where="mesh", fix="give one, or an observation with a `model`")

@@ -166,6 +166,11 @@ def model_rays(cam_from_model: Alignment) -> tuple[FloatArray, FloatArray]:
 _CORNER_SIGNS = np.array([[1 if i >> k & 1 else -1 for k in range(3)] for i in range(8)]) / 2
 BOX_EDGES = tuple((i, i | 1 << k) for k in range(3) for i in range(8) if not i >> k & 1)
 """The 12 edges as pairs of corner numbers: four along x, four along y, four along z."""
+BOX_FACES = (
+    *((0, 2, 1), (1, 2, 3), (4, 5, 6), (5, 7, 6), (0, 1, 4), (1, 5, 4)),
+    *((2, 6, 3), (3, 6, 7), (0, 4, 2), (2, 4, 6), (1, 3, 5), (3, 7, 5)),
+)
+"""The 12 triangles of the faces, counter-clockwise from outside: z, y, x, the low face first."""
 
 
 def extent(points: FloatArray) -> FloatArray:

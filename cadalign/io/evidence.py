@@ -246,7 +246,8 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     keypoints = {row: each for row, each in enumerate(read.keypoints) if is_found[row]}
     for row, each in keypoints.items():
         if needs_xyz and each.xyz is None:
-            raise DataError("missing", where=f"keypoints[{row}].xyz")
+            fix = "give it, or name a category as `shape`"
+            raise DataError("missing", where=f"keypoints[{row}].xyz", fix=fix)
     places = [each.xyz or (0, 0, 0) for each in keypoints.values()]
     depths = np.array([each.depth for each in keypoints.values()], dtype=float)
     names, ids = _column(keypoints, "name"), _column(keypoints, "semantic_id")
@@ -280,10 +281,15 @@ def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
     return values
 
 
-def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
-    """Convert camera, keypoints, photo and evidence of an image to the fields of a file."""
+def write_image_fields(
+    image: ObservedImage, folder: Path | None, *, needs_xyz: bool = True
+) -> dict[str, Any]:
+    """Convert camera, keypoints, photo and evidence of an image to the fields of a file.
+
+    Unless it ``needs_xyz``, they are left out if all are zero.
+    """
     columns = {
-        "xyz": image.points_3d,
+        "xyz": image.points_3d if needs_xyz or image.points_3d.any() else None,
         "uv": image.points_2d,
         "sigma": image.sigma,
         "semantic_id": image.ids,

@@ -108,7 +108,7 @@ def _read_fields(data: Any, folder: Path | None) -> tuple[ObservationFields, Seq
         return read, read.views
     if read.camera is UNSET:
         raise DataError("missing", where="camera")
-    if not read.keypoints and read.init is None and read.mask is None:
+    if "keypoints" not in data and read.init is None and read.mask is None:
         raise DataError("missing", where="keypoints", fix="give keypoints, `mask` or `init`")
     if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
         what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
@@ -241,7 +241,8 @@ class Observation(ObservedImage):
 
         Every ``pixel_origin`` is written.
         """
-        written = [write_image_fields(view, folder) for view in self.views]
+        needs_xyz = self.shape is None
+        written = [write_image_fields(view, folder, needs_xyz=needs_xyz) for view in self.views]
         data: dict[str, Any] = {"views": written} if self.others else written[0]
         further = {
             "model": self.model and written_path(self.model, folder=folder),

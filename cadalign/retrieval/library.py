@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import IntArray
-from cadalign.datasets.image_keypoints import first_names, plain_name
+from cadalign.datasets.image_keypoints import first_names
 from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
@@ -27,6 +27,7 @@ from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable, check_
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import plain_name
 
 logger = logging.getLogger("cadalign")
 _FIX = f"`cadalign annotate PHOTO MODEL` marks keypoints, and writes MODEL{SUFFIX}"

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import count
+from itertools import combinations, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.datasets.image_keypoints import first_names, plain_name
+from cadalign.arrays import IntArray
+from cadalign.datasets.image_keypoints import first_names
 from cadalign.errors import DataError, InputError, quote, refuse_unused, unknown_name
 from cadalign.io.documents import convert, name_file, read_json
 from cadalign.io.files import once_per_file
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.retrieval.options import RetrievalOptions
+from cadalign.shapes.parts import plain_name
 
 if TYPE_CHECKING:
     from cadalign.retrieval.library import Library
@@ -29,7 +31,6 @@ logger = logging.getLogger("cadalign")
 _LEAST_KEYPOINTS = 3
 _Table = tuple[tuple[str, str | int], ...]
 """Pairs of a library's keypoint name and the shape's name or id."""
-_NO_TABLE: _Table = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +58,8 @@ class ObservationRetrieval:
         from cadalign.shapes.model import open_shape  # not needed for the commands' help
 
         library, shape = _library(self.library), open_shape(self.shape)
-        table = _NO_TABLE if self.keypoint_names is None else _read_table(self.keypoint_names)
-        return library, _shape_of_library(shape, library, table, str(self.library))
+        table: _Table = () if self.keypoint_names is None else _read_table(self.keypoint_names)
+        return library, relabel(shape, library, table, str(self.library))
 
     def read(
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
@@ -69,28 +70,22 @@ class ObservationRetrieval:
         return changes.apply(seen, where)
 
     def resolve_ids(self, seen: Observation, where: str) -> Observation:
-        """Add the library's semantic ids by keypoint names, unless the observation has ids.
+        """Find the library's semantic ids of an observation's keypoints.
 
-        With a shape, names may be the shape's; ids are always the library's.
+        Names count: the library's if it has them all, otherwise the shape's. The observation's own
+        ids are kept if they agree with one of the two, or if neither has the names. The result has
+        the shape's names, since `cadalign fit --shape` does not know the library's ids.
 
         Raises DataError if there are no keypoints, or if they have neither ids nor names;
         InputError if the library lacks a name.
         """
         library, shape = self.open_files()
-        if shape is not None and seen.names and {*seen.names} <= {*shape.names}:
-            return replace(seen, ids=np.array(shape.ids)[shape.rows(seen.names)])
-        ids = seen.ids
         with name_file(where):
             if not len(seen.points_2d):
                 raise DataError("there are no keypoints")
-            if ids is None:
-                if seen.names is None:
-                    fix = "give each its id or name in the library"
-                    raise DataError("the keypoints have no semantic_id and no name", fix=fix)
-                ids = library.ids_of(seen.names)
+            ids = _ids_in_library(seen, library, shape)
         if shape is None or not shape.names:
             return replace(seen, ids=ids)
-        # `cadalign fit --shape` knows the shape's names, but not the library's ids.
         name_of = dict(zip(shape.ids, shape.names, strict=True))
         given = seen.names or [f"keypoint {label}" for label in ids]
         names = [name_of.get(int(label), name) for label, name in zip(ids, given, strict=True)]
@@ -115,10 +110,21 @@ class ObservationRetrieval:
         )
 
 
-# Cached, since caches of the ranking and of estimates are by the shape.
-@lru_cache(4)
-def _shape_of_library(shape: ShapeModel, library: Library, table: _Table, where: str) -> ShapeModel:
-    return relabel(shape, library.names, dict(table), where=where)
+def _ids_in_library(seen: Observation, library: Library, shape: ShapeModel | None) -> IntArray:
+    """The library's ids (n,) of an observation's keypoints; see `resolve_ids`."""
+    ids, names = seen.ids, seen.names
+    if names is None:
+        if ids is None:
+            fix = "give each its id or name in the library"
+            raise DataError("the keypoints have no semantic_id and no name", fix=fix)
+        return ids
+    by_name, of_shape = list[IntArray](), () if shape is None else (shape.resolve,)
+    for read in (library.ids_of, *of_shape):
+        with suppress(InputError):
+            by_name.append(np.array(read(names)))
+    if ids is not None and (not by_name or any(np.array_equal(ids, each) for each in by_name)):
+        return ids
+    return by_name[0] if by_name else library.ids_of(names)
 
 
 @once_per_file(4)
@@ -128,36 +134,37 @@ def _library(path: Path) -> Library:
     return Library.open(path)
 
 
-def relabel(
-    shape: ShapeModel, names: Mapping[str, int], table: Mapping[str, str | int], *, where: str
-) -> ShapeModel:
+@lru_cache(4)  # caches of the ranking and of estimates are by the shape
+def relabel(shape: ShapeModel, library: Library, pairs: _Table, where: str) -> ShapeModel:
     """Give a shape's keypoints the ids that a library has for them.
 
-    ``names`` are the library's ids by name, ``table`` the shape's name or id of those that differ.
-    Without names of its own, the library has the shape's ids. Raises InputError if the table has an
-    unknown name or gives a keypoint twice, or fewer than 3 keypoints agree.
+    The pairs are of the library's names that differ from the shape's. Without names of its own, the
+    library has the shape's ids. Raises InputError if the table has an unknown name, two
+    names mean one keypoint, or fewer than 3 keypoints agree.
     """
+    names, table = library.names, dict(pairs)
     if unused := [name for name in table if name not in names]:
         raise unknown_name("keypoint of the library", unused[0], names, where="keypoint_names")
     if not names or not (table or shape.names):
         return shape
-    row_of = {f"keypoint {label}": row for row, label in enumerate(shape.ids)}
-    row_of |= {plain_name(name): row for row, name in enumerate(shape.names)}
-    own = {row_of.get(plain_name(each), -1): names[each] for each in names if each not in table}
-    own.pop(-1, None)
-    named = dict[int, str]()
-    for row, name in zip(shape.rows(table.values(), where="keypoint_names"), table, strict=True):
-        if (other := named.setdefault(int(row), name)) != name:
-            what = f"{quote(other)} and {quote(name)} are one keypoint of {shape.category}"
-            raise InputError(what, where="keypoint_names", fix="leave out one of the two")
-        own[int(row)] = names[name]
-    if len(own) < _LEAST_KEYPOINTS:
-        what = f"{len(own)} of its keypoints ({first_names(list(names))}) are {shape.category}'s"
+    shape.resolve(table.values(), where="keypoint_names")
+    numbers = {f"keypoint {label}": label for label in shape.ids}
+    labels = [table.get(name, numbers.get(plain_name(name), name)) for name in names]
+    known = zip(shape.resolve(labels, where=None), names.items(), strict=True)
+    found = [(own, number, name) for own, (name, number) in known if own is not None]
+    for (own, number, name), (other, second, other_name) in combinations(found, 2):
+        if (own == other) != (number == second):
+            of = shape.category if own == other else "the library"
+            what = f"{quote(name)} and {quote(other_name)} are one keypoint of {of}"
+            fix = "give each name a keypoint of its own"
+            raise InputError(what, where="keypoint_names" if table else where, fix=fix)
+    ids = {own: number for own, number, _ in found}
+    if len(ids) < _LEAST_KEYPOINTS:
+        what = f"{len(ids)} of its keypoints ({first_names(list(names))}) are {shape.category}'s"
         fix = "give keypoint_names, a JSON table of its names with the shape's names"
         raise InputError(what, where=where, fix=fix)
-    free = count(1 + max(names.values()))  # for keypoints that the library lacks
-    ids = tuple(own[row] if row in own else next(free) for row in range(len(shape.ids)))
-    return replace(shape, ids=ids)
+    free = count(1 + max(*names.values(), *library.known_ids().tolist()))  # that the library lacks
+    return replace(shape, ids=tuple(ids[own] if own in ids else next(free) for own in shape.ids))
 
 
 @once_per_file(4)

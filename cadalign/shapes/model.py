@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ from cadalign.shapes.parts import (
     check_axis,
     check_ids,
     check_text,
+    plain_name,
 )
 
 if TYPE_CHECKING:
@@ -90,7 +91,8 @@ class ShapeModel:
     few_keypoints: FewKeypoints | None = None
     """Decrease of the inflation for few given keypoints, calibrated likewise; None for none."""
     names: tuple[str, ...] = ()
-    """Names of the keypoints, in the order of ``ids``, accepted wherever an id is; may be empty."""
+    """Names of the keypoints, in the order of ``ids``, accepted wherever an id is; may be empty.
+    The part of a keypoint is its name up to the first comma."""
     lines: tuple[tuple[int, int], ...] = ()
     """Rows of keypoints that belong together, such as the ends of a leg, for skeletons."""
 
@@ -122,12 +124,18 @@ class ShapeModel:
         object.__setattr__(self, "inflation", float(self.inflation))
         for name in ("category", "unit"):
             object.__setattr__(self, name, check_text(getattr(self, name), name))
-        if self.names and len(check_ids(self.names, "names")) != len(ids):
-            raise InputError(f"{len(self.names)} for {len(ids)} keypoints", where="names")
-        if not all(0 <= row < len(ids) for line in self.lines for row in line):
-            raise InputError(f"a row is not below {len(ids)}", where="lines")
+        names = tuple(check_text(name, f"names[{row}]") for row, name in enumerate(self.names))
+        if names and len(check_ids(names, "names")) != len(ids):
+            raise InputError(f"{len(names)} for {len(ids)} keypoints", where="names")
+        for row, line in enumerate(self.lines):
+            if len(line) != 2 or not {*line} <= {*range(len(ids))}:
+                what = f"{quote(line)} is not a pair of rows below {len(ids)}"
+                raise InputError(what, where=f"lines[{row}]")
         object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "lines", tuple((int(one), int(two)) for one, two in self.lines))
         object.__setattr__(self, "components", tuple(self.components))
+        self.resolve(ids)  # refuses a name or id of two keypoints
 
     @classmethod
     def learn(
@@ -334,26 +342,61 @@ class ShapeModel:
         parts = [(each.weight, each.mean, each.covariance) for each in self.components]
         return Gaussians(*map(np.array, zip(*parts, strict=True)))
 
-    def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:
-        """Rows of the keypoints with the given ids or names, (n,) int.
+    def resolve(
+        self,
+        ids: Collection[Hashable] | None = None,
+        names: Collection[str] | None = None,
+        *,
+        where: str | None = "ids",
+    ) -> tuple[KeypointId | None, ...]:
+        """Find the shape's ids of all keypoints of an object.
+
+        Parameters
+        ----------
+        ids : (n,) int or str, optional
+            Ids, or names in their place.
+        names : (n,) str, optional
+            Names. If the shape has one of them, they count and not the ids, which may be a file's
+            own numbers. Case is ignored; ``_`` and ``-`` are equal to a space.
+        where : str or None
+            Place that errors name. None: return None for keypoints that the shape lacks.
 
         Raises
         ------
         InputError
-            If ids are unknown; the message names them.
+            If the shape lacks a keypoint; the message names it.
+
+        Examples
+        --------
+        >>> ShapeModel.pretrained("chair").resolve(names=["seat, front left", "Back, top-left"])
+        (5, 1)
         """
-        row_of = {
-            label: row for labels in (self.names, self.ids) for row, label in enumerate(labels)
-        }
-        wanted = [label.item() if isinstance(label, np.generic) else label for label in ids]
-        missing = [label for label in wanted if label not in row_of]
-        if missing:
-            raise InputError(
-                f"{self.category} has no keypoint {', '.join(quote(each) for each in missing[:8])}",
-                where=where,
-                fix=f"known are {quote(list(self.names or self.ids))}",
-            )
-        return np.array([row_of[label] for label in wanted], dtype=np.int64)
+        labels: list[Any] = list(names or ())
+        if ids is not None and not any(plain_name(each) in self._id_of for each in labels):
+            labels = [each.item() if isinstance(each, np.generic) else each for each in ids]
+        elif names is None:
+            raise InputError("the keypoints have no semantic_id and no name", where=where)
+        found = tuple(self._id_of.get(plain_name(each)) for each in labels)
+        missing = [quote(each) for each, own in zip(labels, found, strict=True) if own is None]
+        if missing and where is not None:
+            what = f"{self.category} has no keypoint {', '.join(missing[:8])}"
+            fix = f"leave out what it lacks, or give one of {quote(list(self.names or self.ids))}"
+            raise InputError(what, where=where, fix=fix)
+        return found
+
+    def rows(self, ids: Collection[Hashable], *, where: str = "ids") -> IntArray:
+        """Rows of the keypoints with the given ids or names, (n,) int; see `resolve`."""
+        return np.array(list(map(self.ids.index, self.resolve(ids, where=where))), dtype=np.int64)
+
+    @cached_property
+    def _id_of(self) -> dict[Hashable, KeypointId]:
+        """Ids by id and by name, in plain form."""
+        id_of = dict[Hashable, KeypointId]()
+        for row, label in (*enumerate(self.ids), *enumerate(self.names)):
+            if id_of.setdefault(plain_name(label), self.ids[row]) != self.ids[row]:
+                what, fix = f"{quote(label)} is also another keypoint", "give each keypoint its own"
+                raise InputError(what, where="names" if self.names else "ids", fix=fix)
+        return id_of
 
     def nearest(self, points_3d: npt.ArrayLike) -> int:
         """Row in ``training`` of the model with the nearest keypoints.

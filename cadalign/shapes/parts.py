@@ -250,6 +250,13 @@ def check_box(box: npt.ArrayLike, where: str) -> FloatArray:
     return corners
 
 
+def plain_name(name: Any) -> Any:
+    """Normalise a name for comparison: lower case, spaces for ``_`` and ``-``; numbers stay."""
+    if not isinstance(name, str):
+        return name
+    return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
+
+
 def check_ids(ids: Sequence[KeypointId], where: str) -> tuple[KeypointId, ...]:
     """Check keypoint ids: whole numbers or texts, of one kind, each once."""
     found: list[KeypointId] = []

@@ -128,7 +128,7 @@ def test_the_observation_alone_holds_all_that_is_marked(case: Case) -> None:
         xyz = case.instance.points_3d[case.instance.ids.tolist().index(keypoint)].tolist()
         point = ModelKeypoint(f"keypoint {keypoint}", tuple(xyz), 100 + keypoint)
         place(session, session.model.registry.add(point), uv)
-    session.model.keypoints_path.unlink()
+    (case.folder / "sample_chair_000.keypoints.json").unlink()
     again = case.open(keypoints=None)
     unnumbered = [
         sorted((p["name"], p["uv"], tuple(p["xyz"])) for p in page_state(each, 0)["pairs"])
@@ -188,7 +188,7 @@ def test_an_observation_that_others_changed_is_not_written_over(case: Case) -> N
 def test_keypoints_that_others_changed_are_not_written_over(case: Case) -> None:
     session = case.open(prepared=False)
     place(session, 0, [10, 20])
-    keypoints = session.model.keypoints_path
+    keypoints = case.folder / "sample_chair_000.keypoints.json"
     theirs = keypoints.read_text().replace("keypoint 1", "armrest")
     keypoints.write_text(theirs)
     perform(session, 0, {"do": "place_uv", "uv": [30, 40]})
@@ -425,7 +425,7 @@ def test_annotations_of_a_namesake_are_refused_and_kept(case: Case) -> None:
     keypoints = case.folder / "sample_chair_000.keypoints.json"
     kept = case.observation.read_bytes(), keypoints.read_bytes()
     ours = f"belongs to the model {case.model.resolve()}, not {other.resolve()}; "
-    fix = "give another --observation or --out"
+    fix = "give that model, or give another --observation or --out"
     assert refusal_text(lambda: case.open(model=other)) == f"{keypoints}: {ours}{fix}"
     assert (case.observation.read_bytes(), keypoints.read_bytes()) == kept
     keypoints.unlink()  # the observation is refused without its help

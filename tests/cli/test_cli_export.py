@@ -149,6 +149,18 @@ def test_a_shape_without_meshes_is_exported_as_its_box(tmp_path: Path) -> None:
     np.testing.assert_allclose(ends, np.sort(found.box.corners, axis=0)[[0, -1]], atol=1e-5)
 
 
+@pytest.mark.parametrize("ending", ["obj", "glb"])
+def test_a_shape_of_keypoints_in_a_plane_is_exported_as_its_flat_box(
+    tmp_path: Path, ending: str
+) -> None:
+    flat = MORE * [1, 1, 0]
+    shape = ShapeModel.from_basis(flat, [flat * [0, 1, 0]], [0.1])
+    found = align(shape, View(CAMERA, CAMERA.project(POSE.apply(flat))))
+    mesh = load_mesh(found.export(tmp_path / f"flat.{ending}"))
+    assert len(mesh.faces) == 12
+    assert np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0))[1][2] < 1e-5
+
+
 def test_the_best_match_of_an_own_library_is_exported_in_the_estimated_shape(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

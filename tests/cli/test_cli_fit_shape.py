@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from cadalign import (
     View,
     align,
 )
+from cadalign.batch.observation_fit import views_of
 from cadalign.cli import main
 from cadalign.io.observation import Observation
 from cadalign.render.layers import UNSEEN_COLOR
@@ -118,6 +119,13 @@ def test_keypoints_are_found_by_name_and_need_no_xyz(
     assert capsys.readouterr().out == f"{expected}\n"
 
 
+def test_names_of_the_shape_count_before_numbers_of_the_file(numbered: ShapeModel) -> None:
+    names = {"ids": np.array([3, 0, 7]), "names": ("c", "a", "h")}
+    seen = Observation(CORNERS[:3], CORNERS[:3, :2] + 9, CAMERA, **names)
+    assert views_of(seen, replace(numbered, names=NAMES))[0].ids == (2, 0, 7)
+    assert views_of(seen, numbered)[0].ids == (3, 0, 7)
+
+
 def test_shape_of_the_file_is_fitted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
 ) -> None:
@@ -130,7 +138,7 @@ def test_shape_of_the_file_is_fitted(
     expected = align(numbered, View(CAMERA, [each["uv"] for each in keypoints], ids=range(6)))
     assert capsys.readouterr().out == f"{expected}\n"
     line = refusal_line(capsys, "fit", path, "--shape-sigma", "0.1")
-    assert line == f"{path}: keypoints[0].xyz: missing"
+    assert line == f"{path}: keypoints[0].xyz: missing; give it, or name a category as --shape"
     assert refusal_line(capsys, "fit", path, "--similar") == (
         "--similar: has no effect together with a learned shape; leave out one of the two"
     )
@@ -224,12 +232,22 @@ def test_a_shape_that_was_replaced_is_not_exported(
     [
         (
             {"ids": np.array([0, 1, 9, 3, 12, 5])},
-            "keypoints.semantic_id: box has no keypoint 9, 12; known are [0, 1, 2, 3, 4, 5, 6, 7]",
+            "keypoints: box has no keypoint 9, 12; "
+            "leave out what it lacks, or give one of [0, 1, 2, 3, 4, 5, 6, 7]",
+        ),
+        (
+            {"ids": np.array([0, 1, 9, 3, 4, 5]), "names": NAMES[:6]},
+            "keypoints: box has no keypoint 9; "
+            "leave out what it lacks, or give one of [0, 1, 2, 3, 4, 5, 6, 7]",
         ),
         (
             {"ids": None, "names": NAMES[:6]},
-            "keypoints: the keypoints have no semantic_id; "
-            "the shape of box identifies its keypoints by their semantic ids",
+            "keypoints: box has no keypoint 'a', 'b', 'c', 'd', 'e', 'f'; "
+            "leave out what it lacks, or give one of [0, 1, 2, 3, 4, 5, 6, 7]",
+        ),
+        (
+            {"ids": None},
+            "keypoints: the keypoints have no semantic_id and no name",
         ),
         (
             {"ids": np.array([0, 1, 2, 3, 1, 5])},

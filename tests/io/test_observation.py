@@ -123,7 +123,10 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
             "object, pixel_origin, shape, size, symmetry, unfinished, up, up_axis, up_sigma_deg, "
             "views",
         ),
-        (changed("keypoints.2.xyz", ...), "{path}: keypoints[2].xyz: missing"),
+        (
+            changed("keypoints.2.xyz", ...),
+            "{path}: keypoints[2].xyz: missing; give it, or name a category as `shape`",
+        ),
         (
             changed("keypoints.2.uvw", 3),
             "{path}: keypoints[2]: unknown field 'uvw', did you mean 'uv'?; "

@@ -107,6 +107,8 @@ def test_a_mask_needs_no_keypoints() -> None:
             assert read.evidence.mask == Path("mask.png")
     with pytest.raises(DataError, match="keypoints: missing"):
         Observation.from_dict({"camera": CAMERA, "image": "photo.png"})
+    nothing = {**SEEN, "keypoints": []}  # an annotation from which all was deleted
+    assert Observation.from_dict(nothing).to_dict() == nothing
 
 
 @pytest.mark.parametrize("data", [ONE, SEVERAL])
@@ -139,6 +141,12 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
     assert not Observation.load(path, needs_xyz=False).others[0].points_3d.any()
     with pytest.raises(DataError, match=r"views\[1\]\.keypoints\[0\]\.xyz: missing"):
         Observation.load(path)
+
+
+def test_missing_xyz_are_not_written() -> None:
+    bare = [{name: each[name] for name in each if name != "xyz"} for each in KEYPOINTS]
+    data = {**SEEN, "keypoints": bare, "shape": "chair"}
+    assert Observation.from_dict(data).to_dict() == data
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from cadalign.errors import InputError
 from cadalign.io.observation import Observation
 from cadalign.io.pretrained import CATEGORIES, shape_path
 from cadalign.render import look_at
-from cadalign.retrieval.query import relabel
 
 CAMERA = Camera(640, 480, fx=900.0, fy=900.0, cx=319.5, cy=239.5)
 POSE = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 3.0], [1.0, 1.0, 1.0])
@@ -111,6 +110,7 @@ def test_observations_name_a_category_or_a_file_beside_them(tmp_path):
 def test_runs_depend_on_the_content_of_a_category():
     options = FitRunOptions(estimate=ObservationFit(shape=Path("chair")))
     assert shape_path("chair") in options.files
+    assert options.as_config()["estimate"]["shape"] == "chair"
 
 
 def test_saving_keeps_every_number(tmp_path):
@@ -122,19 +122,6 @@ def test_saving_keeps_every_number(tmp_path):
         np.testing.assert_array_equal(opened.components[0].mean, each.components[0].mean)
         assert opened.names == each.names
         assert opened.lines == each.lines
-
-
-def test_a_library_with_other_names_needs_a_table():
-    shape = ShapeModel.pretrained("laptop")
-    names = {"fr": 7, "hr": 3, "hl": 5, "Screen, top-left": 1}
-    with pytest.raises(InputError, match="give keypoint_names"):
-        relabel(shape, names, {}, where="my.cadalign")
-    table = {"fr": "keyboard, front right", "hr": 1, "hl": "hinge, left"}
-    assert relabel(shape, names, table, where="").ids == (7, 3, 5, 8, 9, 1)
-    with pytest.raises(InputError, match=r"unknown keypoint of the library 'x'"):
-        relabel(shape, names, {"x": 0}, where="")
-    with pytest.raises(InputError, match=r"keypoint_names: 'fr' and 'hr' are one keypoint of lap"):
-        relabel(shape, names, {"fr": "hinge, right", "hr": 1}, where="")
 
 
 def exchange(name):

@@ -370,7 +370,8 @@ def test_refusals(learned: ShapeModel) -> None:
     )
     assert "NaN or infinite" in refusal_text(lambda: Example("m", [1], np.full((1, 3), np.nan)))
     assert refusal_text(lambda: learned.rows([1, 99, 98])) == (
-        "ids: table has no keypoint 99, 98; known are [0, 1, 2, 3, 4, 5, 6]"
+        "ids: table has no keypoint 99, 98; "
+        "leave out what it lacks, or give one of [0, 1, 2, 3, 4, 5, 6]"
     )
     assert refusal_text(lambda: ShapeModel.learn(some, components=0)) == (
         "components: 0 is not a whole number >= 1"
@@ -445,3 +446,65 @@ def test_a_mirror_is_learned_only_for_a_symmetric_category() -> None:
     leaning = completed + np.where(np.arange(3) == 2, 0.6, 0.0) * completed[..., 1:2]
     assert is_symmetry(leaning, find_mirror(leaning, 0))
     assert not is_symmetry(leaning, find_mirror(leaning, 2))
+
+
+LETTERS = "abcdefg"
+NAMED = ShapeModel.from_basis(TABLE, [TABLE], [0.1], ids=list(LETTERS), category="table")
+NAMES = ("front left", "front right", "back left", "back right", "rear", "side", "top")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": range(7)}, "names[0]: expected a text, got int 0"),
+        ({"names": NAMES[:3]}, "names: 3 for 7 keypoints"),
+        ({"names": [*"bacdefg"]}, "names: 'b' is also another keypoint; give each keypoint its ow"),
+        ({"names": [*NAMES[:6], "Front_Left"]}, "names: 'Front_Left' is also another keypoint; gi"),
+        ({"lines": [(0, 1), (2,)]}, "lines[1]: (2,) is not a pair of rows below 7"),
+        ({"lines": [(0, 1, 2)]}, "lines[0]: (0, 1, 2) is not a pair of rows below 7"),
+        ({"lines": [(0, 1.5)]}, "lines[0]: (0, 1.5) is not a pair of rows below 7"),
+        ({"lines": [(-1, 0)]}, "lines[0]: (-1, 0) is not a pair of rows below 7"),
+    ],
+)
+def test_names_and_lines_that_no_file_could_hold_are_refused(
+    change: dict[str, Any], message: str
+) -> None:
+    assert refusal_text(lambda: replace(NAMED, **change)).startswith(message)
+
+
+def test_names_and_lines_of_other_kinds_are_kept_as_tuples(tmp_path: Path) -> None:
+    shape = replace(NAMED, names=np.array(NAMES), lines=np.array([[0, 1], [2.0, 3]]))
+    shape.save(tmp_path / "a.shape")
+    for each in (shape, ShapeModel.open(tmp_path / "a.shape")):
+        assert (each.names, each.lines) == (NAMES, ((0, 1), (2, 3)))
+    assert replace(NAMED, names=[*LETTERS]).rows(["b", "A"]).tolist() == [1, 0]
+
+
+NUMBERED = replace(NAMED, ids=tuple(range(7)), names=NAMES)
+
+
+@pytest.mark.parametrize(
+    ("ids", "names", "found"),
+    [
+        ([3, 0], None, (3, 0)),
+        (["rear", np.int64(2), "Front_Right"], None, (4, 2, 1)),
+        (None, ["top", "leg"], (6, None)),
+        ([3, 9], ["leg", "arm"], (3, None)),  # none of the names is the shape's
+        ([3, 2], ["front right", "side"], (1, 5)),  # numbers of the user's own
+        ([3, 2], ["Front right", "leg"], (1, None)),
+    ],
+)
+def test_names_count_before_ids_if_the_shape_has_one(
+    ids: Any, names: Any, found: tuple[int | None, ...]
+) -> None:
+    assert NUMBERED.resolve(ids, names, where=None) == found
+    if None not in found:
+        assert NUMBERED.resolve(ids, names) == found
+
+
+def test_unknown_names_are_listed_with_the_known_ones() -> None:
+    text = refusal_text(lambda: NUMBERED.resolve([3, 2], ["rear", "leg"], where="keypoints"))
+    assert text.startswith(
+        "keypoints: table has no keypoint 'leg'; leave out what it lacks, or give one of ['front l"
+    )
+    assert refusal_text(NUMBERED.resolve) == "ids: the keypoints have no semantic_id and no name"

@@ -26,15 +26,14 @@ from cadalign.evaluation.methods import Method, fit_methods
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.runs.work import Plan
 from cadalign.geometry.alignment import extent
+from cadalign.io.pretrained import pretrained_path
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
 
 _LEAST_SAMPLE = 12  # models of each category of a sample dataset
 _METHOD = "optimal"
-_LEARNED = ", learned shape"
-"""End of the category's name of objects whose own model is not used."""
-_UNSEEN = ("bottle", "chair")
+_SHAPES = ("bottle", "chair")
 """Categories of the sample dataset whose keypoints have KeypointNet's ids."""
 
 
@@ -70,30 +69,33 @@ class DemoOptions(ExperimentOptions):
         return 0
 
 
+class ShapeTask(KeypointTask):
+    """One view of an object whose own model is not used, but its category's learned shape."""
+
+
 class DemoViews(KeypointViews):
     """Views of models; for learned shapes, the model's box is that of its keypoints."""
 
     def instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
-        return list(map(_with_box, tasks, super().instances(tasks)))
-
-
-def _with_box(task: KeypointTask, found: Instance | Exception) -> Instance | Exception:
-    if isinstance(found, Exception) or not task.category.endswith(_LEARNED):
+        found = super().instances(tasks)
+        for row, (task, each) in enumerate(zip(tasks, found, strict=True)):
+            if isinstance(task, ShapeTask) and isinstance(each, Instance):
+                points = each.gt.inverse(each.cam_from_model.apply(task.hull.xyz))
+                found[row] = replace(each, bounds=extent(points))
         return found
-    points = found.gt.inverse(found.cam_from_model.apply(task.hull.xyz))
-    return replace(found, bounds=extent(points))
 
 
 def solve_view(view: KeypointView, *, views: DemoViews) -> Any:
     """Align the model, or the learned shape of its category."""
     from cadalign.estimation.align import align
     from cadalign.estimation.view import View
-    from cadalign.shapes.model import ShapeModel
+    from cadalign.shapes.model import open_shape
 
     task, seen = view
-    if not task.category.endswith(_LEARNED):
+    if not isinstance(task, ShapeTask):
         return fit_methods()[_METHOD].solve(views.method_input(view))
-    shape, sigma = ShapeModel.pretrained(task.category.removesuffix(_LEARNED)), views.options.sigma
+    assert task.model is not None
+    shape, sigma = open_shape(pretrained_path(task.model.category)), views.options.sigma
     known = np.isin(seen.ids, shape.ids)
     ids = seen.ids[known].tolist()
     found = align(shape, View(seen.camera, seen.points_2d[known], ids=ids, sigma=sigma))
@@ -121,15 +123,15 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
         root, methods=(_METHOD,), seed=options.seed, max_models=options.per_category
     )
     tasks = KeypointTasks(dataset, chosen)
-    learned = [
-        replace(task, category=f"{task.category}{_LEARNED}", view=1)
+    of_shapes = [
+        ShapeTask(**vars(task) | {"category": f"{task.category}, learned shape", "view": 1})
         for task in tasks
-        if options.root is None and task.category in _UNSEEN
+        if options.root is None and task.category in _SHAPES
     ]
     views = DemoViews(chosen, folder.made_for_pictures())
     benchmark = Benchmark(views, (Method(_METHOD, partial(solve_view, views=views)),))
     more = {"methods": list(chosen.methods), "annotations": tasks.fingerprint()}
-    return benchmark.plan(replace(options, root=root), [*tasks, *learned], chunk=1, **more)
+    return benchmark.plan(replace(options, root=root), [*tasks, *of_shapes], chunk=1, **more)
 
 
 _ABOUT = (

@@ -91,10 +91,7 @@ class App {
       this.photo.open(image.number, image);
       if (image.count > 1) this.listPhotos();
     }
-    if (this.modelKey !== state.model.key) {
-      this.modelKey = state.model.key;
-      this.loadModel(state);
-    }
+    this.loadModel(state);
     if (state.selected !== null) this.selected = state.selected;
     if (!state.pairs.some(({ pair }) => pair === this.selected)) this.selected = null;
     this.layout.show(state);

@@ -42,6 +42,7 @@ export class ModelView {
     this.markers = new Markers(this.stage);
     this.stage.beforeDraw = () => this.markers.face();
     this.state = null;
+    this.wanted = null; // the model that is or will be shown
     this.mesh = null; // until it is there, nothing can be clicked on
     this.upAxis = "y";
     this.raycaster = new Raycaster();
@@ -50,9 +51,19 @@ export class ModelView {
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));
   }
 
-  /** Fetch and show the model of a photo. */
+  /** Fetch and show the model of a photo, unless it is shown; after a failure, the next call tries again. */
   async load(number, { key, is_skeleton: isSkeleton }) {
-    const buffer = await (await fetched(`model/${number}?${key}`)).arrayBuffer();
+    if (key === this.wanted?.key) return;
+    const wanted = (this.wanted = { key });
+    this.clear();
+    let buffer;
+    try {
+      buffer = await (await fetched(`model/${number}?${key}`)).arrayBuffer();
+    } catch (error) {
+      if (wanted === this.wanted) this.wanted = null;
+      throw error;
+    }
+    if (wanted !== this.wanted) return; // the page has gone on to another model
     this.isSkeleton = isSkeleton;
     this.wasAligned = false;
     const [faces, edges] = new Uint32Array(buffer, 0, 2);
@@ -76,11 +87,20 @@ export class ModelView {
     const axes = new AxesHelper(1);
     axes.scale.copy(this.ends);
     const grey = new LineBasicMaterial({ color: 0x7d8794, transparent: true, opacity: 0.4 });
-    if (this.group) this.stage.scene.remove(this.group);
     this.group = new Group().add(this.mesh, new LineSegments(creases, grey), axes);
     this.stage.scene.add(this.group);
     this.frame();
     if (this.state) this.show(this.state, this.selected);
+  }
+
+  clear() {
+    for (const { geometry, material } of this.group?.children ?? []) {
+      geometry.dispose();
+      material.dispose();
+    }
+    this.group?.removeFromParent();
+    this.mesh = this.group = null;
+    this.stage.invalidate();
   }
 
   /** See the whole model from a direction, given for one of which y points up. */

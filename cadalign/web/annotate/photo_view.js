@@ -39,8 +39,7 @@ export class PhotoView {
     this.offset = { x: 0, y: 0 };
     this.state = null;
     this.selected = null;
-    this.dragged = null; // the pair that is moved, and where to
-    this.draggedRing = null; // the estimated keypoint that is moved, likewise
+    this.dragged = null; // the pair or the estimated keypoint that is moved, and where to
     this.isBoxing = false; // a drag draws a box, in place of panning
     this.box = null; // two corners
     this.listen();
@@ -221,9 +220,8 @@ export class PhotoView {
     if (!press.moved) return;
     if (this.isBoxing) this.box = [start, place].map((corner) => this.clamp(this.toPixel(corner)));
     else if (pair || ring) {
-      const uv = this.toPixel({ x: place.x + grip.x, y: place.y + grip.y });
-      if (pair) this.drag(pair.pair, uv);
-      else this.draggedRing = { ...ring, uv: this.clamp(uv) };
+      const uv = this.clamp(this.toPixel({ x: place.x + grip.x, y: place.y + grip.y }));
+      this.dragged = { ...(pair ?? ring), uv };
     }
     else this.pan(place.x - last.x, place.y - last.y);
     press.last = place;
@@ -235,19 +233,17 @@ export class PhotoView {
     this.press = null;
     if (!press) return;
     const { start, pair, ring, moved } = press;
-    const { draggedRing } = this;
-    this.draggedRing = null;
     if (moved && this.isBoxing) this.handlers.onBox(box);
     else if (moved && pair) this.handlers.onMove(pair.pair, this.dragged.uv);
     else if (!moved && pair) this.handlers.onSelect(pair.pair);
-    else if (moved && ring) this.handlers.onTake(ring.keypoint, draggedRing.uv);
+    else if (moved && ring) this.handlers.onTake(ring.keypoint, this.dragged.uv);
     // The proposed keypoint is placed where the click is, which may be beside its estimate.
     else if (ring && ring.keypoint !== this.state.model.proposed) this.handlers.onTake(ring.keypoint, ring.uv);
     else if (!moved && !this.isBoxing) this.place(start);
   }
 
   cancel() {
-    this.press = this.dragged = this.draggedRing = this.box = null;
+    this.press = this.dragged = this.box = null;
     this.invalidate();
   }
 
@@ -313,7 +309,7 @@ export class PhotoView {
     this.stroke(box, "#ff5a63", 2);
     this.drawRegions(regions, unmarked);
     for (const each of unmarked) {
-      const { keypoint, uv } = this.draggedRing?.keypoint === each.keypoint ? this.draggedRing : each;
+      const { keypoint, uv } = this.dragged?.keypoint === each.keypoint ? this.dragged : each;
       const { x, y } = this.toView(uv);
       this.context.beginPath();
       this.context.arc(x, y, 3.5, 0, 2 * Math.PI);

@@ -47,8 +47,6 @@ def result_text(result: Any) -> str:
         translation += f" +- ({deviations})" if is_known else " (not determined)"
         stretch = [f"{text}{deviation_text(std.scale[k])}" for k, text in enumerate(stretch)]
         known_to = deviation_text(std.focal)
-    if unit := getattr(result.model, "unit", ""):  # a learned shape's
-        translation += f" [{unit}]"
     lines = [
         f"{result.method}: {some} keypoints{views}, rms {result.rms:.3g} px",
         f"  rotation     {rotation}",

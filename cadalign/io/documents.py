@@ -136,7 +136,7 @@ def convert(
         return path_from(text, folder)
 
     try:
-        with suppress(msgspec.ValidationError):  # raised also by NumPy arrays and numbers
+        with suppress(msgspec.ValidationError, IndexError):  # also by NumPy arrays and numbers
             return msgspec.convert(data, kind, dec_hook=read)
         with suppress(AttributeError, TypeError, RecursionError):
             data = msgspec.to_builtins(data, enc_hook=lambda each: each.tolist())

@@ -99,8 +99,8 @@ def test_obj_polygons_keep_the_number_of_their_line(write):
     np.testing.assert_allclose(mesh.surface_points([1], [[0, 0, 1]]), [[0, 0, 1]])
 
 
-def test_obj_accepts_tabs_windows_ends_and_comments(write):
-    text = "# a\r\n\r\nv\t0 0\t0\r\nv 1 0  0\r\nv 0 1 0 1.0\r\no x\r\ns off\r\n  f 1 2 3  "
+def test_obj_accepts_tabs_continued_lines_windows_ends_and_comments(write):
+    text = "# a\r\n\r\nv\t0 0\t0\r\nv 1 0 \\\r\n 0\r\nv 0 1 0 1.0\r\no x\r\ns off\r\n  f 1 2 3  "
     mesh = load_mesh(write(text))
     np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from support.timing import reference_seconds, timed
+from support.timing import Measure, ratio, reference_seconds, timed
 
 from cadalign.datasets import (
     BlindPnP,
@@ -93,6 +93,20 @@ def test_hostile_meshes_are_refused_quickly(tmp_path: Path, name: str, text: str
         assert len(str(caught.value)) < 600 + len(str(tmp_path))
 
     assert reference_seconds(timed(refuse), below=LONGEST_REFUSAL, rounds=1) < LONGEST_REFUSAL
+
+
+@pytest.mark.timing
+def test_time_for_continued_lines_grows_with_the_file(tmp_path: Path) -> None:
+    def loading(count: int) -> Measure:
+        path = tmp_path / f"{count}.obj"
+        path.write_text(TRIANGLE + "f " + "1 \\\n" * count + "2 3\n")
+        assert len(load_mesh(path).faces) == count
+        return timed(lambda: load_mesh(path))
+
+    # Eight times the lines, which leave the caches: 8 to 12 times the time. With the square of
+    # their number it would be 64 times.
+    assert ratio(loading(400_000), loading(50_000), below=24) < 24
+    assert reference_seconds(loading(400_000), below=0.6) < 0.6
 
 
 @pytest.mark.parametrize("options", ["-s 1 1", "-s 1", "-o", "-s", "-mm 1", ""])

@@ -32,6 +32,7 @@ from cadalign.io.observation import Observation, read_camera
 logger = logging.getLogger("cadalign")
 
 _LEAST_PAIRS = 4  # of an alignment without further evidence
+_USUAL = 0.5  # share of a category's models with a keypoint that is proposed before rarer ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,10 @@ class Annotation:
         # A part that was skipped and has no mark, such as an armrest, is likely absent.
         absent = set(map(_part_of, self.skipped)) - set(map(_part_of, marked))
         likely = [row for row in left if _part_of(points[row].name) not in absent]
-        for group in (likely, left):
+        learned = self.model.shape.learned
+        shares = () if learned is None else learned.shares
+        usual = [row for row in likely if not shares or shares[row] > _USUAL]
+        for group in (usual, likely, left):
             row = next_row(positions_of(points), rows, group, live.result)
             if row is not None:
                 return points[row].semantic_id

@@ -235,7 +235,9 @@ def learn_parts(
         )
         for weight, mean, covariance in parts
     )
-    return {"ids": ids, "components": tuple(learned), "training": training, **calibration}
+    has = np.isfinite(rows[:, : len(ids), 0])
+    found = {"ids": ids, "components": tuple(learned), "training": training}
+    return found | {"shares": tuple(has.mean(axis=0).round(3).tolist()), **calibration}
 
 
 def _vectors(rows: FloatArray, mirror: Mirror | None) -> Vectors:

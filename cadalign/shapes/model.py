@@ -95,6 +95,9 @@ class ShapeModel:
     The part of a keypoint is its name up to the first comma."""
     lines: tuple[tuple[int, int], ...] = ()
     """Rows of keypoints that belong together, such as the ends of a leg, for skeletons."""
+    shares: tuple[float, ...] = ()
+    """Share of the learned models that have each keypoint, in the order of ``ids``; may be empty.
+    """
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
@@ -127,6 +130,8 @@ class ShapeModel:
         names = tuple(check_text(name, f"names[{row}]") for row, name in enumerate(self.names))
         if names and len(check_ids(names, "names")) != len(ids):
             raise InputError(f"{len(names)} for {len(ids)} keypoints", where="names")
+        if self.shares and len(self.shares) != len(ids):
+            raise InputError(f"{len(self.shares)} for {len(ids)} keypoints", where="shares")
         for row, line in enumerate(self.lines):
             if len(line) != 2 or not {*line} <= {*range(len(ids))}:
                 what = f"{quote(line)} is not a pair of rows below {len(ids)}"

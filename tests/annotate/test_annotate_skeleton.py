@@ -102,6 +102,13 @@ def test_keypoints_far_from_each_other_are_proposed_first(photo: Path) -> None:
     assert any("leg" in name or "base" in name for name in names)
 
 
+def test_keypoints_that_few_models_have_are_proposed_last(photo: Path) -> None:
+    session, shape = opened(photo), ShapeModel.pretrained("chair")
+    usual = {name for name, share in zip(shape.names, shape.shares, strict=True) if share > 0.5}
+    assert {take_proposed(session) for _ in usual} == usual
+    assert take_proposed(session).startswith(("armrest", "star base", "column"))
+
+
 def test_skipped_keypoints_are_proposed_again_after_all_others(photo: Path) -> None:
     session = opened(photo)
     count = len(page_state(session, 0)["keypoints"])

@@ -226,6 +226,15 @@ def test_a_mirror_pairs_the_keypoints_that_it_exchanges(axis: int) -> None:
     assert [order[row] for row in found.partners] == [mirror_image[k] for k in order]
 
 
+def test_shares_are_those_of_the_models_with_a_keypoint() -> None:
+    rng = np.random.default_rng(0)
+    examples = [
+        Example(f"{k}", list("abcdefgh")[: 8 - k % 2], rng.normal(size=(8, 3))[: 8 - k % 2])
+        for k in range(20)
+    ]
+    assert ShapeModel.learn(examples).shares == (1.0,) * 7 + (0.5,)
+
+
 def test_from_basis_keeps_the_covariance_of_its_modes() -> None:
     rng = np.random.default_rng(0)
     modes, sigmas = rng.normal(size=(3, 7, 3)), np.array([0.3, 0.0, 0.1])

@@ -51,10 +51,9 @@ class PyrenderRenderer(RaycastRenderer):
     """Renderer with OpenGL under EGL; depth, triangle indices and normals are ray cast.
 
     Models with transparent parts and cameras with lens distortion are ray cast entirely. OpenGL
-    antialiases with 4 samples for all ``samples`` above 1. All
-    renderers of a process share one OpenGL context. A forked process must not use its parent's
-    context, so start pools with "spawn". Broken OpenGL libraries may crash the process:
-    `make_renderer` tests them in a subprocess first.
+    antialiases with 4 samples for all ``samples`` above 1. All renderers of a process share one
+    OpenGL context. A forked process must not use its parent's context, so start pools with "spawn".
+    Broken OpenGL libraries may crash the process: `make_renderer` tests them in a subprocess first.
     """
 
     name = "pyrender"

@@ -21,7 +21,7 @@ import tyro
 from cadalign import Example, ShapeModel
 from cadalign.datasets import KeypointNet
 from cadalign.io.pretrained import CATEGORIES, pretrained_path
-from cadalign.shapes.examples import examples_of, find_other_axes
+from cadalign.shapes.examples import examples_of, find_other_axes, stack_keypoints
 
 _LEAST_SHARE = 0.01  # of the models that have a keypoint; fewer are slips of annotators
 NAMES = Path(__file__).with_name("keypoint_names.toml")
@@ -33,7 +33,7 @@ def learn(
 ) -> ShapeModel:
     """Learn a category's shape; models with other axes and rare keypoints are left out."""
     kept = list(examples)
-    while turned := find_other_axes(kept):
+    while turned := find_other_axes(stack_keypoints(kept)[1]):
         kept = [each for row, each in enumerate(kept) if row not in turned]
     count = Counter(label for each in kept for label in each.ids)
     known = {label for label, n in count.items() if n >= _LEAST_SHARE * len(kept)}

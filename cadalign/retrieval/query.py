@@ -139,8 +139,8 @@ def relabel(shape: ShapeModel, library: Library, pairs: _Table, where: str) -> S
     """Give a shape's keypoints the ids that a library has for them.
 
     The pairs are of the library's names that differ from the shape's. Without names of its own, the
-    library has the shape's ids. Raises InputError if the table has an unknown name, two
-    names mean one keypoint, or fewer than 3 keypoints agree.
+    library has the shape's ids. Raises InputError if the table has an unknown name, two names mean
+    one keypoint, or fewer than 3 keypoints agree.
     """
     names, table = library.names, dict(pairs)
     if unused := [name for name in table if name not in names]:

@@ -140,8 +140,8 @@ def tabulate(
     _check_names(examples)
     _check_shared(examples)
     _warn_of_units(examples)
-    _warn_of_axes(examples)
-    ids, points = _stack(examples)
+    ids, points = stack_keypoints(examples)
+    _warn_of_axes(examples, points)
     boxes = np.full((len(examples), BOX_ROWS, 3), np.nan)
     measured = 2 * sum(each.bounds is not None for each in examples) >= len(examples)
     for box, each in zip(boxes, examples, strict=True):
@@ -157,8 +157,8 @@ def tabulate(
     return ids, np.concatenate([points, boxes], axis=1), shapes
 
 
-def _stack(examples: Sequence[Example]) -> tuple[tuple[KeypointId, ...], FloatArray]:
-    """All ids, sorted, and the models' keypoints (N, m, 3), NaN if missing."""
+def stack_keypoints(examples: Sequence[Example]) -> tuple[tuple[KeypointId, ...], FloatArray]:
+    """Return all ids, sorted, and the models' keypoints (N, m, 3), NaN if missing."""
     ids = tuple(sorted({label for each in examples for label in each.ids}))
     column = {label: row for row, label in enumerate(ids)}
     points = np.full((len(examples), len(ids), 3), np.nan)
@@ -210,12 +210,11 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
         _warn("of another size", len(rows), examples, whole[rows[0]], why)
 
 
-def find_other_axes(examples: Sequence[Example]) -> dict[int, FloatArray]:
+def find_other_axes(rows: FloatArray) -> dict[int, FloatArray]:
     """Find models that fit the others only with exchanged or reversed axes.
 
-    Returns the axes (3, 3) that fit, by the row of the model.
+    ``rows`` are keypoints (N, m, 3), NaN if missing. Returns the axes (3, 3) that fit, by row.
     """
-    _, rows = _stack(examples)
     count = np.isfinite(rows[..., 0]).sum(axis=1)
     some = np.flatnonzero(count >= _LEAST_TO_TURN)
     if not len(some):
@@ -234,8 +233,8 @@ def find_other_axes(examples: Sequence[Example]) -> dict[int, FloatArray]:
     return turned
 
 
-def _warn_of_axes(examples: Sequence[Example]) -> None:
-    if turned := find_other_axes(examples):
+def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
+    if turned := find_other_axes(rows):
         odd, turn = next(iter(turned.items()))
         axes = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
         why = f"fit with ({', '.join(axes)}) as (x, y, z)"

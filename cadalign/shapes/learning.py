@@ -236,8 +236,13 @@ def learn_parts(
         for weight, mean, covariance in parts
     )
     has = np.isfinite(rows[:, : len(ids), 0])
-    found = {"ids": ids, "components": tuple(learned), "training": training}
-    return found | {"shares": tuple(has.mean(axis=0).round(3).tolist()), **calibration}
+    return {
+        "ids": ids,
+        "components": tuple(learned),
+        "training": training,
+        "shares": tuple(has.mean(axis=0).round(3).tolist()),
+        **calibration,
+    }
 
 
 def _vectors(rows: FloatArray, mirror: Mirror | None) -> Vectors:

@@ -174,6 +174,7 @@ def test_missing_materials_are_warned_of_and_become_plain(write, caplog, library
         ("v 0 0 0\nv 1 0 0.1.2\nv 0 1 0\nf 1 2 3\n", "line 2"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0.1.2\nf 1 2 3\n", "line 3"),
         ("v 0 0 0\nv 1 0 zero\nv 0 1 0\nf 1 2 3\n", "line 2"),
+        ("v 0 0 \\\n0\nv 1 0 zero\nv 0 1 0\nf 1 2 3\n", "line 3"),
         ("f 1 2 3\n", "1 faces, but no vertices"),
         (f"{SQUARE}f 1 2 5\n", "face 0 (counted from 0) names 5/0, but there are 4 vertices"),
         (f"{SQUARE}f 1 2 3\nf 1 2 0\n", "face 1 (counted from 0) names 0/0"),

@@ -42,9 +42,10 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     corners, before = list[tuple[int, int]](), list[tuple[int, int]]()
     sizes, looks = list[int](), list[int]()
     libraries, numbers, look = list[str](), {"": 0}, 0  # numbers of materials, by name
-    text = data.replace(b"\t", b" ").replace(b"\r\n", b"\n")
-    # A backslash at the end continues a line; a continued line counts as one.
-    for number, line in enumerate(text.replace(b"\\\n", b" ").splitlines(), start=1):
+    text, number = data.replace(b"\t", b" ").replace(b"\r\n", b"\n"), 0
+    # A backslash at the end continues a line; "\v" keeps count of them, and is a blank.
+    for line in text.replace(b"\\\n", b" \v").splitlines():
+        number += 1 + line.count(b"\v")
         key, _, body = line.strip().partition(b" ")
         words = body.partition(b"#")[0].split()
         try:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Iterator
@@ -93,6 +95,48 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if hasattr(config, "workerinput"):
         long = {item.path for item in items if item.get_closest_marker("long")}
         items.sort(key=lambda item: (item.path not in long, len(item.path.parts), item.path))
+
+
+HANGS_AFTER = float(os.environ.get("CADALIGN_HANGS_AFTER", 300))  # [s]
+STACKS = pytest.StashKey[Path]()
+_OF_PYTEST = r"site-packages/(_pytest|pluggy|xdist|execnet)/|^$|<string>"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Choose a folder for the stacks of tests that hang, and tell the processes of xdist of it."""
+    given = getattr(config, "workerinput", {"stacks": ""})["stacks"]
+    config.stash[STACKS] = Path(given or tempfile.mkdtemp(prefix="cadalign-stacks-"))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    node.workerinput["stacks"] = str(node.config.stash[STACKS])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """End the process of a test that hangs, also one that hangs in compiled code."""
+    with (item.config.stash[STACKS] / str(os.getpid())).open("w") as file:
+        file.write(f"{item.nodeid} hangs\n")
+        file.flush()
+        faulthandler.dump_traceback_later(HANGS_AFTER, file=file, exit=True)
+        try:
+            return (yield)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            file.truncate(0)
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Print the stacks of tests that hung, below all other results."""
+    if hasattr(config, "workerinput"):
+        return
+    folder = config.stash[STACKS]
+    for file in folder.iterdir():
+        if "Timeout" in (text := file.read_text()):
+            lines = [line for line in text.splitlines() if not re.search(_OF_PYTEST, line)]
+            terminalreporter.write("\n".join(["", *lines, ""]))
+    shutil.rmtree(folder)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -12,7 +12,7 @@ from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -99,13 +99,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 HANGS_AFTER = float(os.environ.get("CADALIGN_HANGS_AFTER", 300))  # [s]
 STACKS = pytest.StashKey[Path]()
-_OF_PYTEST = r"site-packages/(_pytest|pluggy|xdist|execnet)/|^$|<string>"
+STACK = pytest.StashKey[IO[str]]()
+_OF_PYTEST = r"site-packages/(_pytest|pluggy|xdist|execnet)/|<string>|^$|^Extension modules"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Choose a folder for the stacks of tests that hang, and tell the processes of xdist of it."""
+    """Open a file for the stack of a test that hangs or crashes, one for each process."""
     given = getattr(config, "workerinput", {"stacks": ""})["stacks"]
-    config.stash[STACKS] = Path(given or tempfile.mkdtemp(prefix="cadalign-stacks-"))
+    folder = Path(given or tempfile.mkdtemp(prefix="cadalign-stacks-"))
+    file = (folder / str(os.getpid())).open("a")
+    config.stash[STACKS], config.stash[STACK] = folder, file
+    faulthandler.enable(file)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -116,27 +120,24 @@ def pytest_configure_node(node: Any) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """End the process of a test that hangs, also one that hangs in compiled code."""
-    with (item.config.stash[STACKS] / str(os.getpid())).open("w") as file:
-        file.write(f"{item.nodeid} hangs\n")
-        file.flush()
-        faulthandler.dump_traceback_later(HANGS_AFTER, file=file, exit=True)
-        try:
-            return (yield)
-        finally:
-            faulthandler.cancel_dump_traceback_later()
-            file.truncate(0)
+    file = item.config.stash[STACK]
+    print(item.nodeid, file=file, flush=True)
+    faulthandler.dump_traceback_later(HANGS_AFTER, file=file, exit=True)
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+        file.truncate(0)
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Print the stacks of tests that hung, below all other results."""
+    """Print the stacks of tests that did not end, below all other results."""
     if hasattr(config, "workerinput"):
         return
-    folder = config.stash[STACKS]
-    for file in folder.iterdir():
-        if "Timeout" in (text := file.read_text()):
-            lines = [line for line in text.splitlines() if not re.search(_OF_PYTEST, line)]
-            terminalreporter.write("\n".join(["", *lines, ""]))
-    shutil.rmtree(folder)
+    for file in config.stash[STACKS].iterdir():
+        lines = [line for line in file.read_text().splitlines() if not re.search(_OF_PYTEST, line)]
+        terminalreporter.write("\n".join(["", *lines, ""]) if lines else "")
+    shutil.rmtree(config.stash[STACKS])
 
 
 @pytest.hookimpl(wrapper=True)

@@ -52,7 +52,9 @@ class Program:
     def wait(self, timeout: float = 300) -> int:
         self._process.join(timeout)
         status = self.poll()
-        assert status is not None, "it does not end"
+        if status is None:
+            self.kill()
+            raise AssertionError("it does not end")
         return status
 
     def send_signal(self, number: signal.Signals) -> None:

@@ -97,24 +97,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: (item.path not in long, len(item.path.parts), item.path))
 
 
-HANGS_AFTER = float(os.environ.get("CADALIGN_HANGS_AFTER", 300))  # [s]
-STACKS = pytest.StashKey[Path]()
+HANGS_AFTER = 900  # [s]; more than the limits that tests have for what they start
 STACK = pytest.StashKey[IO[str]]()
 _OF_PYTEST = r"site-packages/(_pytest|pluggy|xdist|execnet)/|<string>|^$|^Extension modules"
+
+
+def stacks_folder(config: pytest.Config) -> Path:
+    return Path(config.stash[STACK].name).parent
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Open a file for the stack of a test that hangs or crashes, one for each process."""
     given = getattr(config, "workerinput", {"stacks": ""})["stacks"]
     folder = Path(given or tempfile.mkdtemp(prefix="cadalign-stacks-"))
-    file = (folder / str(os.getpid())).open("a")
-    config.stash[STACKS], config.stash[STACK] = folder, file
+    config.stash[STACK] = file = (folder / str(os.getpid())).open("a")
     faulthandler.enable(file)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:
-    node.workerinput["stacks"] = str(node.config.stash[STACKS])
+    node.workerinput["stacks"] = str(stacks_folder(node.config))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -134,10 +136,11 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     """Print the stacks of tests that did not end, below all other results."""
     if hasattr(config, "workerinput"):
         return
-    for file in config.stash[STACKS].iterdir():
-        lines = [line for line in file.read_text().splitlines() if not re.search(_OF_PYTEST, line)]
-        terminalreporter.write("\n".join(["", *lines, ""]) if lines else "")
-    shutil.rmtree(config.stash[STACKS])
+    for file in stacks_folder(config).iterdir():
+        for line in file.read_text().splitlines():
+            if not re.search(_OF_PYTEST, line):
+                terminalreporter.write_line(line)
+    shutil.rmtree(stacks_folder(config))
 
 
 @pytest.hookimpl(wrapper=True)
